@@ -1,0 +1,74 @@
+"""What the emulated devices share: one scene, one guide, one laser, one robot, and noise that can be repeated."""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from echolume_drivers.emulated.scene import Scene
+
+
+@dataclass(frozen=True)
+class Board:
+    """The calibration chessboard on the stage: inner corners, square, and ``rig_from_board`` (4, 4).
+
+    The board frame has its origin at the first inner corner, x along the columns, y along the rows, and z out of
+    the print towards the cameras.
+    """
+
+    columns: int
+    rows: int
+    square_mm: float
+    rig_from_board: NDArray[np.float64]
+
+
+@dataclass
+class Stage:
+    """Shared state of the emulated rig; every access holds `lock`."""
+
+    seed: int
+    scene: Scene
+    speed: float = 1.0
+    air_temperature_c: float = 22.0
+    board: Board | None = None
+    guide_x_mm: Callable[[], float] = lambda: 0.0
+    laser_on: bool = False
+    robot_pose: Callable[[], NDArray[np.float64]] = lambda: np.zeros(6)
+    lock: threading.RLock = field(default_factory=threading.RLock)
+    _laser_watchers: list[Callable[[bool], None]] = field(default_factory=list[Callable[[bool], None]])
+    _attempts: dict[tuple[str, tuple[int, ...]], int] = field(default_factory=dict[tuple[str, tuple[int, ...]], int])
+
+    def watch_laser(self, callback: Callable[[bool], None]) -> None:
+        """Wire a device to the laser-enable line; called at every edge, outside the lock."""
+        self._laser_watchers.append(callback)
+
+    def switch_laser(self, on: bool) -> None:
+        """Drive the laser-enable line."""
+        with self.lock:
+            changed = on != self.laser_on
+            self.laser_on = on
+        if changed:
+            for callback in self._laser_watchers:
+                callback(on)
+
+    def noise(self, device: str, position: NDArray[np.float64]) -> np.random.Generator:
+        """Random numbers keyed by (seed, device, position to 1 um, attempt at that position)."""
+        spot = tuple(int(v) for v in np.round(np.asarray(position, dtype=np.float64) * 1000))
+        with self.lock:
+            attempt = self._attempts.get((device, spot), 0)
+            self._attempts[device, spot] = attempt + 1
+        text = repr((self.seed, device, spot, attempt)).encode()
+        return np.random.default_rng(int.from_bytes(hashlib.sha256(text).digest()[:8], "little"))
+
+    def place(self, scene: Scene | None = None, board: Board | None = None) -> None:
+        """Put another scene (or a board over it) on the bench; noise attempts start anew."""
+        with self.lock:
+            if scene is not None:
+                self.scene = scene
+            self.board = board
+            self._attempts.clear()

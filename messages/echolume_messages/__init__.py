@@ -1,0 +1,1 @@
+"""What crosses between the rooms: topics, messages, codec, bus, clock, geometry, calibration, errors."""

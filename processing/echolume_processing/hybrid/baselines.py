@@ -1,0 +1,75 @@
+"""The maps that the hybrid map has to beat: each sense alone, and the plain union of their points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from echolume_messages.plan import MapField
+from echolume_messages.types import Structured
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from echolume_processing.hybrid.grid import STEPS_PER_MM, accumulate, cell_index
+from echolume_processing.hybrid.model import cell_centres_mm
+
+NEAREST_MM = 20.0
+"""A cell further than this from any ultrasonic point is not claimed by sound."""
+
+
+@dataclass(frozen=True)
+class Baselines:
+    """Height images (rows, columns) in mm; nan where a map claims nothing."""
+
+    optical_mm: NDArray[np.float64]
+    ultrasonic_mm: NDArray[np.float64]
+    union_mm: NDArray[np.float64]
+
+
+def baselines(optical: Structured, ultrasonic: Structured, field: MapField) -> Baselines:
+    """Maps of light alone, of sound alone (nearest contact point, the paper's Fig. 12) and of all points mixed.
+
+    Parameters
+    ----------
+    optical
+        ``OPTICAL_POINT`` (n,).
+    ultrasonic
+        ``ULTRASONIC_POINT`` (m,).
+    field
+        The raster of cells.
+    """
+    return Baselines(
+        accumulate(optical, field).height_mm,
+        nearest(ultrasonic, field),
+        union(optical, ultrasonic, field),
+    )
+
+
+def nearest(points: Structured, field: MapField) -> NDArray[np.float64]:
+    """Height of the nearest ultrasonic contact point at each cell within `NEAREST_MM`, else nan."""
+    out = np.full(field.shape, np.nan)
+    points = np.sort(points, order=["x_mm", "y_mm", "z_mm"])
+    points = points[np.isfinite(points["z_mm"]) & np.isfinite(points["x_mm"]) & np.isfinite(points["y_mm"])]
+    if not points.size:
+        return out
+    x_mm, y_mm = np.meshgrid(*cell_centres_mm(field))
+    tree = cKDTree(np.column_stack((points["x_mm"], points["y_mm"])).astype(np.float64))
+    _, index = tree.query(np.column_stack((x_mm.ravel(), y_mm.ravel())), distance_upper_bound=NEAREST_MM)
+    index = np.asarray(index, dtype=np.int64)
+    found = index < points.size
+    out.ravel()[found] = points["z_mm"][index[found]]
+    return out
+
+
+def union(optical: Structured, ultrasonic: Structured, field: MapField) -> NDArray[np.float64]:
+    """Mean of all points in a cell, whichever sense they come from (the paper's hybrid image)."""
+    cell = np.concatenate([cell_index(field, p["x_mm"], p["y_mm"]) for p in (optical, ultrasonic)])
+    z_mm = np.concatenate([p["z_mm"].astype(np.float64) for p in (optical, ultrasonic)])
+    good = (cell >= 0) & np.isfinite(z_mm)
+    steps = np.round(z_mm[good] * STEPS_PER_MM)  # whole numbers: their sum does not depend on the order
+    size = field.shape[0] * field.shape[1]
+    number = np.bincount(cell[good], minlength=size)
+    total = np.bincount(cell[good], weights=steps, minlength=size)
+    mean = np.full(size, np.nan)
+    np.divide(total, number * STEPS_PER_MM, out=mean, where=number > 0)
+    return mean.reshape(field.shape)

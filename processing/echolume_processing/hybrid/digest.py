@@ -1,0 +1,29 @@
+"""The digest of a hybrid map: the same evidence gives the same sixteen hex digits."""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+
+from echolume_processing.hybrid.model import HybridMap
+
+
+def digest(found: HybridMap) -> str:
+    """SHA-256 over the field and the sorted cells, without times or names; first 16 hex digits.
+
+    Notes
+    -----
+    Every nan is written as the same nan. The digest holds for the same machine and versions: other versions of
+    the numeric libraries may round differently.
+    """
+    cells = np.sort(found.cells, order=["iy", "ix"])
+    state = hashlib.sha256()
+    state.update(np.array([*found.field.x_mm, *found.field.y_mm, found.field.cell_mm], dtype="<f8").tobytes())
+    for name in cells.dtype.names or ():
+        column = np.ascontiguousarray(cells[name])
+        if column.dtype.kind == "f":
+            column = np.where(np.isnan(column), np.float32(np.nan), column + np.float32(0.0))
+        state.update(name.encode())
+        state.update(column.tobytes())
+    return state.hexdigest()[:16]

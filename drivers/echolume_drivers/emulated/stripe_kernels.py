@@ -1,0 +1,262 @@
+"""Compiled loops of the stripe renderer: cut the laser plane with the heightfield, march for shadow, splat."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+GLASS = 2
+"""Material.GLASS as a plain number for the compiled code."""
+
+TOP, WALL = 0, 1
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _cell(value: float, origin_mm: float, cell_mm: float) -> int:
+    return int(math.floor((value - origin_mm) / cell_mm))
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _height(field: Floats, ix: int, iy: int) -> float:
+    """Height of a cell; the bench (0) goes on beyond the field."""
+    if ix < 0 or iy < 0 or iy >= field.shape[0] or ix >= field.shape[1]:
+        return 0.0
+    return field[iy, ix]
+
+
+@numba.njit(cache=True, nogil=True)
+def trace(
+    optical: Floats,
+    front: Floats,
+    material: NDArray[np.uint8],
+    grid: Floats,
+    start: Floats,
+    target: Floats,
+    top_mm: float,
+) -> int:
+    """How many glass bodies the straight way from `start` up to `target` crosses; -1 if something opaque is in it.
+
+    `grid` is (x0_mm, y0_mm, cell_mm); nothing is higher than `top_mm`.
+    """
+    x0, y0, cell = grid[0], grid[1], grid[2]
+    dx, dy, dz = target[0] - start[0], target[1] - start[1], target[2] - start[2]
+    ix, iy = _cell(start[0], x0, cell), _cell(start[1], y0, cell)
+    step_x, step_y = (1 if dx > 0 else -1), (1 if dy > 0 else -1)
+    next_x = x0 + (ix + (1 if dx > 0 else 0)) * cell
+    next_y = y0 + (iy + (1 if dy > 0 else 0)) * cell
+    t_x = (next_x - start[0]) / dx if dx != 0.0 else math.inf
+    t_y = (next_y - start[1]) / dy if dy != 0.0 else math.inf
+    d_x = cell / abs(dx) if dx != 0.0 else math.inf
+    d_y = cell / abs(dy) if dy != 0.0 else math.inf
+    t, crossed, inside = 0.0, 0, False
+    while t < 1.0:
+        z = start[2] + t * dz
+        if z > top_mm:
+            break
+        if z < _height(optical, ix, iy) - 1e-6:
+            return -1
+        in_field = 0 <= ix < optical.shape[1] and 0 <= iy < optical.shape[0]
+        in_glass = in_field and material[iy, ix] == GLASS and z < front[iy, ix]
+        if in_glass and not inside:
+            crossed += 1
+        inside = in_glass
+        if t_x < t_y:
+            t = t_x
+            t_x += d_x
+            ix += step_x
+        else:
+            t = t_y
+            t_y += d_y
+            iy += step_y
+    return crossed
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def project(camera: Floats, x: float, y: float, z: float) -> tuple[float, float]:
+    """Distorted image point (u, v) of a rig point; `camera` is CameraTruth.packed."""
+    cx = camera[9] * x + camera[10] * y + camera[11] * z + camera[12]
+    cy = camera[13] * x + camera[14] * y + camera[15] * z + camera[16]
+    cz = camera[17] * x + camera[18] * y + camera[19] * z + camera[20]
+    a, b = cx / cz, cy / cz
+    r2 = a * a + b * b
+    radial = 1 + r2 * (camera[4] + r2 * (camera[5] + r2 * camera[8]))
+    p1, p2 = camera[6], camera[7]
+    return (
+        camera[0] * (a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a)) + camera[2],
+        camera[1] * (b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b) + camera[3],
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def _top_height(optical: Floats, grid: Floats, plane: Floats, y: float, iy: int) -> float:
+    """Where the laser plane, coming from above at this y, meets the cells of row iy."""
+    x_low = (plane[3] - plane[1] * y) / plane[0]
+    first = _height(optical, _cell(x_low, grid[0], grid[2]), iy)
+    x_first = x_low - plane[2] / plane[0] * first
+    ix = _cell(x_first, grid[0], grid[2])
+    second = _height(optical, ix, iy)
+    if second == first:
+        return first
+    x_second = x_low - plane[2] / plane[0] * second
+    if _cell(x_second, grid[0], grid[2]) == ix:
+        return second
+    # The plane leaves the cell on the way down: it meets the side of its higher neighbour.
+    edge = grid[0] + (ix + (1 if x_second > x_first else 0)) * grid[2]
+    return (x_low - edge) * plane[0] / plane[2]
+
+
+@numba.njit(cache=True, nogil=True)
+def cut(
+    optical: Floats, material: NDArray[np.uint8], grid: Floats, plane: Floats, y_mm: tuple[float, float], per_mm: int
+) -> tuple[Floats, NDArray[np.int64]]:
+    """Cut the plane n.X = c (`plane` = n, c) with the optical surface, from low to high y.
+
+    Returns
+    -------
+    spans
+        Short straight pieces, shape (n, 6): their two ends in mm.
+    kinds
+        Shape (n, 3): TOP or WALL, the wall's outward direction along y (-1 or 1), the material.
+    """
+    first, last = _cell(y_mm[0], grid[1], grid[2]), _cell(y_mm[1], grid[1], grid[2])
+    per_cell = max(1, int(round(per_mm * grid[2])))
+    limit = (last - first + 1) * (per_cell + 2 + int(per_mm * (np.max(optical) - np.min(optical) + 1)))
+    spans = np.empty((limit, 6))
+    kinds = np.empty((limit, 3), dtype=np.int64)
+    n = 0
+    for iy in range(first, last + 1):
+        y_start = grid[1] + iy * grid[2]
+        for k in range(per_cell):
+            ya, yb = y_start + k * grid[2] / per_cell, y_start + (k + 1) * grid[2] / per_cell
+            za, zb = _top_height(optical, grid, plane, ya, iy), _top_height(optical, grid, plane, yb, iy)
+            xa = (plane[3] - plane[1] * ya - plane[2] * za) / plane[0]
+            xb = (plane[3] - plane[1] * yb - plane[2] * zb) / plane[0]
+            ix = _cell(0.5 * (xa + xb), grid[0], grid[2])
+            spans[n] = np.array([xa, ya, za, xb, yb, zb])
+            kinds[n, 0], kinds[n, 1] = TOP, 0
+            kinds[n, 2] = _material(material, ix, iy)
+            n += 1
+        y_end = y_start + grid[2]
+        z_here, z_next = _top_height(optical, grid, plane, y_end, iy), _top_height(optical, grid, plane, y_end, iy + 1)
+        rise = z_next - z_here
+        if abs(rise) < 1e-9:
+            continue
+        pieces = max(1, int(math.ceil(per_mm * abs(rise))))
+        owner = iy + 1 if rise > 0 else iy
+        for k in range(pieces):
+            za, zb = z_here + rise * k / pieces, z_here + rise * (k + 1) / pieces
+            xa = (plane[3] - plane[1] * y_end - plane[2] * za) / plane[0]
+            xb = (plane[3] - plane[1] * y_end - plane[2] * zb) / plane[0]
+            spans[n] = np.array([xa, y_end, za, xb, y_end, zb])
+            kinds[n, 0], kinds[n, 1] = WALL, (-1 if rise > 0 else 1)
+            kinds[n, 2] = _material(material, _cell(0.5 * (xa + xb), grid[0], grid[2]), owner)
+            n += 1
+    return spans[:n], kinds[:n]
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _material(material: NDArray[np.uint8], ix: int, iy: int) -> int:
+    if ix < 0 or iy < 0 or iy >= material.shape[0] or ix >= material.shape[1]:
+        return 0
+    return int(material[iy, ix])
+
+
+@numba.njit(cache=True, nogil=True)
+def light(
+    optical: Floats,
+    front: Floats,
+    material: NDArray[np.uint8],
+    grid: Floats,
+    spans: Floats,
+    kinds: NDArray[np.int64],
+    head: Floats,
+    eye: Floats,
+    surface: Floats,
+    transmission: float,
+) -> Floats:
+    """Brightness of each piece as the camera at `eye` sees it, shape (n,); 0 where dark, shadowed or hidden.
+
+    `surface` has a row per material: diffuse albedo, specular strength. Brightness 1 is white, lit at right angles
+    from the bench's distance to the head.
+    """
+    n = spans.shape[0]
+    out = np.zeros(n)
+    top_mm = max(np.max(optical), np.max(front)) + 1e-6
+    reach_mm = head[2]
+    start = np.empty(3)
+    for i in range(n):
+        albedo, specular = surface[kinds[i, 2], 0], surface[kinds[i, 2], 1]
+        if albedo <= 0.0 and specular <= 0.0:
+            continue
+        for k in range(3):
+            start[k] = 0.5 * (spans[i, k] + spans[i, k + 3])
+        normal_y, normal_z = float(kinds[i, 1]), (1.0 if kinds[i, 0] == TOP else 0.0)
+        lx, ly, lz = head[0] - start[0], head[1] - start[1], head[2] - start[2]
+        ex, ey, ez = eye[0] - start[0], eye[1] - start[1], eye[2] - start[2]
+        l_mm, e_mm = math.sqrt(lx * lx + ly * ly + lz * lz), math.sqrt(ex * ex + ey * ey + ez * ez)
+        lit, seen = (normal_y * ly + normal_z * lz) / l_mm, (normal_y * ey + normal_z * ez) / e_mm
+        if lit <= 0.0 or seen <= 0.0:
+            continue
+        start[1] += 1e-7 * normal_y
+        start[2] += 1e-7 * normal_z
+        in_way = trace(optical, front, material, grid, start, head, top_mm)
+        if in_way < 0:
+            continue
+        out_way = trace(optical, front, material, grid, start, eye, top_mm)
+        if out_way < 0:
+            continue
+        hx, hy, hz = lx / l_mm + ex / e_mm, ly / l_mm + ey / e_mm, lz / l_mm + ez / e_mm
+        half = (normal_y * hy + normal_z * hz) / math.sqrt(hx * hx + hy * hy + hz * hz)
+        brightness = albedo * lit + specular * max(half, 0.0) ** 80
+        out[i] = brightness * reach_mm / l_mm * transmission ** (in_way + out_way)
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def images(camera: Floats, spans: Floats) -> Floats:
+    """Image of each piece, shape (n, 3): its middle u, v and its length, all in px."""
+    out = np.empty((spans.shape[0], 3))
+    for i in range(spans.shape[0]):
+        ua, va = project(camera, spans[i, 0], spans[i, 1], spans[i, 2])
+        ub, vb = project(camera, spans[i, 3], spans[i, 4], spans[i, 5])
+        out[i, 0], out[i, 1] = 0.5 * (ua + ub), 0.5 * (va + vb)
+        out[i, 2] = math.sqrt((ub - ua) ** 2 + (vb - va) ** 2)
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def splat(
+    pieces: Floats, brightness: Floats, sigma_px: float, image: NDArray[np.float32], touched: NDArray[np.int64]
+) -> None:
+    """Add a line of Gaussian cross section to `image` (rows, columns); its crest is `brightness`.
+
+    `touched` (rows, 2) gets the first column and the one after the last that are not dark, per row.
+    """
+    rows, columns = image.shape
+    half = int(math.ceil(4.5 * sigma_px))
+    across = np.empty(2 * half + 1)
+    down = np.empty(2 * half + 1)
+    scale = 1.0 / (sigma_px * math.sqrt(2 * math.pi))
+    for i in range(pieces.shape[0]):
+        if brightness[i] <= 0.0:
+            continue
+        u, v = pieces[i, 0], pieces[i, 1]
+        c, r = int(round(u)), int(round(v))
+        if c + half < 0 or r + half < 0 or c - half >= columns or r - half >= rows:
+            continue
+        for k in range(-half, half + 1):
+            across[k + half] = math.exp(-0.5 * ((c + k - u) / sigma_px) ** 2)
+            down[k + half] = math.exp(-0.5 * ((r + k - v) / sigma_px) ** 2)
+        weight = brightness[i] * pieces[i, 2] * scale
+        lo, hi = max(0, c - half), min(columns, c + half + 1)
+        for row in range(max(0, r - half), min(rows, r + half + 1)):
+            gain = np.float32(weight * down[row - r + half])
+            touched[row, 0] = min(touched[row, 0], lo)
+            touched[row, 1] = max(touched[row, 1], hi)
+            for column in range(lo, hi):
+                image[row, column] += gain * np.float32(across[column - c + half])

@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import TypedDict
 
 import numpy as np
-from echolume_messages.plan import MapField
 from numpy.typing import NDArray
+
+from echolume_messages.plan import MapField
 
 TRANSPARENT = 2
 GLASS = 2

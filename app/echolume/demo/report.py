@@ -1,0 +1,91 @@
+"""report.json and the final table of a scan."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, cast
+
+Report = dict[str, Any]
+
+GATES = ("f1_at_1mm",)
+
+
+def verdict(report: Report) -> list[str]:
+    """Why the demo failed; empty where it succeeded.
+
+    It succeeds only if the ledger closes, every acknowledged record is in the archive, and the hybrid map beats each
+    sensor alone on ``f1_at_1mm``.
+    """
+    reasons: list[str] = []
+    for name, row in cast("dict[str, dict[str, int]]", report["ledger"]).items():
+        if row["matched"] != row["planned"] or row["missing"] or row["duplicate"] or row["extra"]:
+            reasons.append(
+                f"ledger: {name}: planned {row['planned']}, matched {row['matched']}, missing {row['missing']}, "
+                f"duplicate {row['duplicate']}, extra {row['extra']}"
+            )
+    archive = report["archive"]
+    if archive["found"] < archive["acknowledged"]:
+        reasons.append(f"archive: {archive['acknowledged']} records acknowledged, {archive['found']} found")
+    maps = report.get("maps")
+    if maps:
+        hybrid = maps["hybrid"]["f1_at_1mm"]
+        reasons.extend(
+            f"map: hybrid f1_at_1mm {hybrid:.3f} does not beat {other} alone ({maps[other]['f1_at_1mm']:.3f})"
+            for other in ("optical", "ultrasonic")
+            if not hybrid > maps[other]["f1_at_1mm"]
+        )
+    return reasons
+
+
+def _cell(value: Any) -> str:
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return "-"
+    return f"{value:.3f}" if isinstance(value, float) else str(value)
+
+
+def _table(head: list[str], rows: list[list[Any]]) -> list[str]:
+    text = [head, *([_cell(v) for v in row] for row in rows)]
+    widths = [max(len(row[k]) for row in text) for k in range(len(head))]
+    return [
+        "  " + "  ".join(v.ljust(w) if k == 0 else v.rjust(w) for k, (v, w) in enumerate(zip(row, widths, strict=True)))
+        for row in text
+    ]
+
+
+def table(report: Report) -> str:
+    """What a person wants to know, as text."""
+    lines: list[str] = []
+    calibration = report["calibration"]
+    lines.append(
+        f"Calibration {calibration['digest']}: left {calibration['left_rms_px']:.3f} px, "
+        f"right {calibration['right_rms_px']:.3f} px, stereo {calibration['stereo_rms_px']:.3f} px, "
+        f"laser plane {calibration['plane_rms_mm']:.3f} mm"
+    )
+    lines.append("")
+    columns = ["planned", "fired", "matched", "missing", "duplicate", "extra"]
+    lines += _table(["ledger", *columns], [[n, *(r[c] for c in columns)] for n, r in report["ledger"].items()])
+    archive = report["archive"]
+    lines.append("")
+    lines.append(
+        f"Archive: {archive['acknowledged']} records acknowledged, {archive['found']} found, "
+        f"{archive['bytes'] / 1e6:.0f} MB"
+    )
+    points = ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in report["points"].items())
+    lines.append(f"Points: {points}")
+    if report.get("maps"):
+        columns = ["f1_at_0p5mm", "f1_at_1mm", "f1_at_2mm", "rmse_mm", "completeness", "glass_recall", "glass_precision"]
+        lines.append("")
+        lines += _table(["map", *columns], [[n, *(r.get(c) for c in columns)] for n, r in report["maps"].items()])
+    lines.append("")
+    timing = report["timing"]
+    resources = report.get("resources", {})
+    lag = timing["processing_lag_p99_ms"]
+    lines.append(
+        f"Time: {timing['total_s']:.0f} s in all (light {timing['optical_pass_s']:.0f} s, "
+        f"sound {timing['ultrasonic_pass_s']:.0f} s)"
+        + (f", processing lag p99 {lag:.0f} ms" if lag is not None else "")
+        + (f", memory at most {resources['peak_pss_mib']:.0f} MiB" if "peak_pss_mib" in resources else "")
+    )
+    lines.append(f"Digest of the hybrid map: {report['digest']['hybrid']}")
+    lines.extend(f"Note: {note}" for note in report.get("notes", []))
+    return "\n".join(lines) + "\n"

@@ -66,7 +66,7 @@ class CameraTruth:
         require_shape("pixels", pixels, (None, 2))
         goal = (pixels - self.matrix[:2, 2]) / np.array([self.matrix[0, 0], self.matrix[1, 1]])
         found = goal.copy()
-        for _ in range(12):
+        for _ in range(8):
             found += goal - distort(found, self.distortion)
         return found
 

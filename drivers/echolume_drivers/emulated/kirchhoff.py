@@ -1,0 +1,215 @@
+"""Kirchhoff integral over facets into a time history per receiver and frequency band (numba).
+
+The scattered pressure of a rigid facet is 2 p_in dG/dn dS. Its delta in time is spread over two bins of an
+oversampled history; directivity and the facet's aperture are taken at a few bands. A wall sees the array and the
+array's image in the floor at its foot: direct, floor-wall, wall-floor and floor-wall-floor.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit  # pyright: ignore[reportAttributeAccessIssue]
+from numpy.typing import NDArray
+
+BANDS = 5
+"""Bands of the history; the loops over them are unrolled."""
+OBSTACLE_MM = 0.3
+"""An obstacle must rise this far above a facet to count."""
+
+
+@njit(cache=True, fastmath=True)
+def clearance(
+    heights: NDArray[np.float64],
+    x0: float,
+    y0: float,
+    cell: float,
+    top: float,
+    px: float,
+    py: float,
+    pz: float,
+    qx: float,
+    qy: float,
+    qz: float,
+    wavelength: float,
+) -> float:
+    """Least clearance of the ray from p up to q over higher terrain, in first-Fresnel radii; negative: hidden."""
+    dx, dy, dz = qx - px, qy - py, qz - pz
+    lateral = math.sqrt(dx * dx + dy * dy)
+    if dz <= 0 or lateral < 0.5 * cell:
+        return 9.0
+    length = math.sqrt(lateral * lateral + dz * dz)
+    least = 9.0
+    rows, columns = heights.shape
+    steps = int(min(1.0, (top + 4.0 - pz) / dz) * lateral / cell)
+    for k in range(1, steps + 1):
+        t = k * cell / lateral
+        i = math.floor((px + t * dx - x0) / cell)
+        j = math.floor((py + t * dy - y0) / cell)
+        if 0 <= i < columns and 0 <= j < rows:
+            ground = heights[j, i]
+            if ground > pz + OBSTACLE_MM:
+                above = (pz + t * dz - ground) * lateral / length
+                radius = math.sqrt(wavelength * length * max(t * (1 - t), 1e-3))
+                least = min(least, above / radius)
+    return least
+
+
+@njit(cache=True, fastmath=True)
+def soft(nu: float) -> float:
+    """Amplitude past an edge at `nu` first-Fresnel radii of clearance: half at the edge, fading into the shadow."""
+    if nu > 4.0:
+        return 1.0
+    if nu >= 0.0:
+        return 1.0 - 0.5 * math.exp(-3.0 * nu)
+    return 0.5 * math.exp(2.0 * nu)
+
+
+@njit(cache=True, fastmath=True)
+def _sinc(x: float) -> float:
+    return 1.0 - x * x / 6.0 if abs(x) < 0.02 else math.sin(x) / x
+
+
+@njit(cache=True, fastmath=True)
+def _floor_free(
+    heights: NDArray[np.float64],
+    x0: float,
+    y0: float,
+    cell: float,
+    wx: float,
+    wy: float,
+    wz: float,
+    ex: float,
+    ey: float,
+    ez: float,
+    floor: float,
+) -> float:
+    """Share of the floor between a wall point and its mirror point towards the array that is there and free."""
+    t = (wz - floor) / (wz - floor + ez - floor)
+    rows, columns = heights.shape
+    good = 0
+    for k in range(1, 6):
+        s = t * k / 4.0
+        x, y = wx + s * (ex - wx), wy + s * (ey - wy)
+        i, j = math.floor((x - x0) / cell), math.floor((y - y0) / cell)
+        ground = heights[j, i] if 0 <= i < columns and 0 <= j < rows else 0.0
+        if abs(ground - floor) < OBSTACLE_MM:
+            good += 1
+        elif ground > floor:
+            return 0.0
+    return good / 5.0
+
+
+@njit(cache=True, fastmath=True)
+def accumulate(
+    centre: NDArray[np.float64],
+    kind: NDArray[np.int8],
+    sign: NDArray[np.float64],
+    size: NDArray[np.float64],
+    floor: NDArray[np.float64],
+    texture: NDArray[np.float64],
+    heights: NDArray[np.float64],
+    dilated: NDArray[np.float64],
+    origin: NDArray[np.float64],
+    cell: float,
+    elements: NDArray[np.float64],
+    axis: NDArray[np.float64],
+    table: NDArray[np.float32],
+    wavenumbers: NDArray[np.float64],
+    radius: float,
+    reach: tuple[float, float],
+    bin_mm: float,
+    start_mm: float,
+    history: NDArray[np.float32],
+) -> None:
+    """Add every facet's echo to `history` (receivers, bins, BANDS).
+
+    `elements` (1 + receivers, 3) are emitter and receivers in the rig frame, `axis` (3,) their direction, `reach`
+    the lateral distance in mm from where facets fade to where they end, `wavenumbers` (BANDS,) in 1/mm; `radius` in mm of the pistons.
+    """
+    receivers = elements.shape[0] - 1
+    bins = history.shape[1]
+    x0, y0 = origin[0], origin[1]
+    top = heights.max()
+    wavelength = 2 * math.pi / wavenumbers[BANDS // 2]
+    last = table.shape[0] - 1
+    ex, ey, ez = elements[0, 0], elements[0, 1], elements[0, 2]
+    r = np.empty((2, receivers + 1))
+    cosine = np.empty((2, receivers + 1))
+    along = np.empty((2, receivers + 1, 2))
+    spread = np.empty((2, receivers + 1))
+    lit = np.empty((2, receivers + 1))
+    beam = np.empty((2, receivers + 1, BANDS))
+    for f in range(centre.shape[0]):
+        px, py, pz = centre[f, 0], centre[f, 1], centre[f, 2]
+        lateral = math.sqrt((px - ex) ** 2 + (py - ey) ** 2)
+        if lateral >= reach[1]:
+            continue
+        fade = 1.0
+        if lateral > reach[0]:
+            fade = 0.5 + 0.5 * math.cos(math.pi * (lateral - reach[0]) / (reach[1] - reach[0]))
+        wall = kind[f] != 0
+        # just outside the wall, so that a ray does not start inside its own column
+        mx = px + (0.51 * cell * sign[f] if kind[f] == 1 else 0.0)
+        my = py + (0.51 * cell * sign[f] if kind[f] == 2 else 0.0)
+        if wall:
+            away = sign[f] * ((ex - px) if kind[f] == 1 else (ey - py))
+            if away <= 0 and abs(away) > 40.0:
+                continue
+        open_sky = not wall and clearance(
+            dilated, x0, y0, cell, top, mx, my, pz, ex, ey, ez, wavelength
+        ) > 4.0  # fmt: skip
+        for image in range(2 if wall else 1):
+            for e in range(receivers + 1):
+                qx, qy, qz = elements[e, 0], elements[e, 1], elements[e, 2]
+                seen = 1.0
+                if image == 1:
+                    seen = lit[0, e] * _floor_free(heights, x0, y0, cell, mx, my, pz, qx, qy, qz, floor[f])
+                    qz = 2 * floor[f] - qz
+                elif not open_sky:
+                    seen = soft(clearance(heights, x0, y0, cell, top, mx, my, pz, qx, qy, qz, wavelength))
+                dx, dy, dz = qx - px, qy - py, qz - pz
+                d2 = dx * dx + dy * dy + dz * dz
+                d = math.sqrt(d2)
+                normal = dz if kind[f] == 0 else (dx if kind[f] == 1 else dy)
+                cosine[image, e] = normal * sign[f] / d
+                u = (dy if kind[f] == 1 else dx) / d
+                v = (dy if kind[f] == 0 else dz) / d
+                ahead = -(dx * axis[0] + dy * axis[1] + (-dz if image == 1 else dz) * axis[2]) / d
+                lit[image, e] = seen if cosine[image, e] > 0 and ahead > 0 else 0.0
+                r[image, e] = d
+                along[image, e, 0], along[image, e, 1] = u, v
+                # mean longer way over the facet and over the piston, which lie flat, not on a sphere
+                flat = (size[f, 0] ** 2 * (1 - u * u) + size[f, 1] ** 2 * (1 - v * v)) / 24.0
+                spread[image, e] = (flat + radius * radius * (1 + ahead * ahead) / 8.0) / d
+                at = (1.0 - ahead * ahead) * last
+                n = min(int(max(at, 0.0)), last - 1)
+                part = at - n
+                for b in range(BANDS):
+                    beam[image, e, b] = table[n, b] * (1 - part) + table[n + 1, b] * part
+        area = size[f, 0] * size[f, 1]
+        for source in range(2 if wall else 1):
+            if lit[source, 0] < 1e-3:
+                continue
+            for image in range(2 if wall else 1):
+                for e in range(1, receivers + 1):
+                    if lit[image, e] < 1e-3:
+                        continue
+                    r1, r2 = r[source, 0], r[image, e]
+                    weight = (
+                        (area * (cosine[source, 0] + cosine[image, e]) / 2 + texture[f] * math.sqrt(area))
+                        * fade * lit[source, 0] * lit[image, e] / (2 * math.pi * r1 * r2)
+                    )  # fmt: skip
+                    at = (r1 + r2 + spread[source, 0] + spread[image, e] - start_mm) / bin_mm
+                    n = int(at)
+                    if at < 0 or n + 1 >= bins:
+                        continue
+                    part = at - n
+                    u = (along[source, 0, 0] + along[image, e, 0]) * size[f, 0] / 2
+                    v = (along[source, 0, 1] + along[image, e, 1]) * size[f, 1] / 2
+                    for b in range(BANDS):
+                        k = wavenumbers[b]
+                        value = weight * beam[source, 0, b] * beam[image, e, b] * _sinc(k * u) * _sinc(k * v)
+                        history[e - 1, n, b] += value * (1 - part)
+                        history[e - 1, n + 1, b] += value * part

@@ -59,6 +59,8 @@ class CommandRefusedError(BusError):
     """A service answered a command with a refusal."""
 
     exit_code = 4
+    error_name: str = ""
+    """The service's own name of the error, where it has no class here."""
 
 
 class DeviceError(EcholumeError):

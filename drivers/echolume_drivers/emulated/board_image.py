@@ -6,8 +6,6 @@ import math
 
 import numba
 import numpy as np
-from echolume_messages.geometry import Matrix, apply, rotation_from_euler, transform
-from echolume_messages.types import Frame
 from numpy.typing import NDArray
 
 from echolume_drivers.emulated.optics import CameraTruth, OpticalTruth, Side, optical_truth
@@ -15,6 +13,8 @@ from echolume_drivers.emulated.sensor import expose
 from echolume_drivers.emulated.stage import Board
 from echolume_drivers.emulated.stripe_image import AMBIENT_DN_PER_S, LAMP_DN_PER_S, STRIPE_DN_PER_S, stripe_light
 from echolume_drivers.emulated.stripe_kernels import images
+from echolume_messages.geometry import Matrix, apply, rotation_from_euler, transform
+from echolume_messages.types import Frame
 
 Floats = NDArray[np.float64]
 
@@ -119,7 +119,7 @@ def render_board(
 def board_light(board: Board, camera: CameraTruth) -> NDArray[np.float32]:
     """Noiseless image (rows, columns) of the board under even light; 1 is white that faces the lamp above."""
     camera_from_board = camera.camera_from_rig @ board.rig_from_board
-    board_from_ray = np.linalg.inv(camera_from_board[:3, [0, 1, 3]])
+    board_from_ray = np.linalg.inv(camera_from_board[:3, [0, 1, 3]]).astype(np.float64)
     image = np.empty((camera.height_px, camera.width_px), dtype=np.float32)
     blur = PSF_SIGMA_PX / np.array([camera.matrix[0, 0], camera.matrix[1, 1]])
     size = np.array([board.columns, board.rows], dtype=np.float64)
@@ -135,7 +135,8 @@ def _stripe_pieces(board: Board, truth: OpticalTruth, side: Side, x_mm: float) -
     along = np.cross(normal, up)
     along *= np.sign(along[1]) / np.linalg.norm(along)
     # The point of both planes whose y is 0, to start from.
-    start = np.linalg.solve(np.stack([normal, up, np.array([0.0, 1.0, 0.0])]), [offset_mm, up @ origin, 0.0])
+    planes = np.stack([normal, up, np.array([0.0, 1.0, 0.0])])
+    start = np.linalg.solve(planes, np.array([offset_mm, float(up @ origin), 0.0]))
     t_mm = np.arange(-_LINE_MM * _PER_MM, _LINE_MM * _PER_MM + 1) / _PER_MM
     ends = start + t_mm[:, None] * along
     middle = 0.5 * (ends[:-1] + ends[1:])

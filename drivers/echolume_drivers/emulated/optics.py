@@ -7,6 +7,8 @@ from functools import cached_property
 from typing import Literal, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
+
 from echolume_messages.geometry import (
     Matrix,
     Points3,
@@ -16,7 +18,6 @@ from echolume_messages.geometry import (
     rotation_from_vector,
     transform,
 )
-from numpy.typing import NDArray
 
 Side: TypeAlias = Literal["left", "right"]
 Pixels2: TypeAlias = NDArray[np.float64]
@@ -73,7 +74,7 @@ class CameraTruth:
 
 @dataclass(frozen=True)
 class OpticalTruth:
-    """Both cameras and the laser: its plane is normal . X = offset_mm + s (normal . guide_direction), s the guide's x."""
+    """Both cameras and the laser plane: normal . X = offset_mm + s (normal . guide_direction), s the guide's x."""
 
     left: CameraTruth
     right: CameraTruth

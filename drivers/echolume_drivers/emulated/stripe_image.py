@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from echolume_messages.types import Frame
 from numpy.typing import NDArray
 
 from echolume_drivers.emulated.optics import OpticalTruth, Side
 from echolume_drivers.emulated.scene import Scene
 from echolume_drivers.emulated.sensor import expose
 from echolume_drivers.emulated.stripe_kernels import cut, images, light, splat
+from echolume_messages.types import Frame
 
 STRIPE_DN_PER_S = 150.0 / 4e-3
 """Crest of the stripe on a white surface that the laser meets at right angles."""
@@ -31,7 +31,7 @@ _PER_MM = 8
 
 @dataclass(frozen=True)
 class StripeTruth:
-    """The visible pieces of a stripe in the order of y: image (n, 2) in px, points (n, 3) in mm, crest brightness (n,)."""
+    """Visible pieces of a stripe in the order of y: image (n, 2) in px, points (n, 3) in mm, crest brightness (n,)."""
 
     pixels: NDArray[np.float64]
     points_mm: NDArray[np.float64]

@@ -18,7 +18,7 @@ TOP, WALL = 0, 1
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _cell(value: float, origin_mm: float, cell_mm: float) -> int:
-    return int(math.floor((value - origin_mm) / cell_mm))
+    return math.floor((value - origin_mm) / cell_mm)
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
@@ -124,7 +124,7 @@ def cut(
         Shape (n, 3): TOP or WALL, the wall's outward direction along y (-1 or 1), the material.
     """
     first, last = _cell(y_mm[0], grid[1], grid[2]), _cell(y_mm[1], grid[1], grid[2])
-    per_cell = max(1, int(round(per_mm * grid[2])))
+    per_cell = max(1, round(per_mm * grid[2]))
     limit = (last - first + 1) * (per_cell + 2 + int(per_mm * (np.max(optical) - np.min(optical) + 1)))
     spans = np.empty((limit, 6))
     kinds = np.empty((limit, 3), dtype=np.int64)
@@ -146,7 +146,7 @@ def cut(
         rise = z_next - z_here
         if abs(rise) < 1e-9:
             continue
-        pieces = max(1, int(math.ceil(per_mm * abs(rise))))
+        pieces = max(1, math.ceil(per_mm * abs(rise)))
         owner = iy + 1 if rise > 0 else iy
         for k in range(pieces):
             za, zb = z_here + rise * k / pieces, z_here + rise * (k + 1) / pieces
@@ -238,7 +238,7 @@ def splat(
     `touched` (rows, 2) gets the first column and the one after the last that are not dark, per row.
     """
     rows, columns = image.shape
-    half = int(math.ceil(4.5 * sigma_px))
+    half = math.ceil(4.5 * sigma_px)
     across = np.empty(2 * half + 1)
     down = np.empty(2 * half + 1)
     scale = 1.0 / (sigma_px * math.sqrt(2 * math.pi))
@@ -246,7 +246,7 @@ def splat(
         if brightness[i] <= 0.0:
             continue
         u, v = pieces[i, 0], pieces[i, 1]
-        c, r = int(round(u)), int(round(v))
+        c, r = round(u), round(v)
         if c + half < 0 or r + half < 0 or c - half >= columns or r - half >= rows:
             continue
         for k in range(-half, half + 1):

@@ -1,0 +1,174 @@
+"""Calibrate the array: templates and gains, delays, speed of sound, and its pose to the rig in six degrees of freedom."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+from echolume_messages.calibration import ArrayCalibration
+from echolume_messages.errors import CalibrationRejectedError
+from echolume_messages.geometry import Matrix, Points3, robot_from_flange, rotation_from_euler, transform
+from echolume_messages.rig import ArraySettings
+from numpy.typing import NDArray
+
+from echolume_processing.ping import Ping
+from echolume_processing.ultrasonic.block import BlockFit, fit_block
+from echolume_processing.ultrasonic.pipeline import UltrasonicPipeline
+from echolume_processing.ultrasonic.plate import PlateFit, fit_plate, plate_paths
+from echolume_processing.ultrasonic.templates import Templates, cut_templates, reference_pings
+
+REFERENCE_MM = 150.0
+"""Height of the perpendicular pings that become the templates, where the plan offers a choice."""
+GATE_MM = 60.0
+"""The plate's echo is looked for this far around its nominal path."""
+MAX_RMS_MM = 0.3
+MIN_PINGS = 6
+
+
+@dataclass(frozen=True)
+class ArrayResult:
+    """The calibration and what speaks for it."""
+
+    calibration: ArrayCalibration
+    plate: PlateFit
+    block: BlockFit | None
+    pings_used: int
+    pings_rejected: list[int]
+    """Triggers whose paths do not fit the plate."""
+
+
+def nominal_flange_from_array(settings: ArraySettings) -> Matrix:
+    """How the array was built on, (4, 4)."""
+    x, y, z, rx, ry, rz = settings.nominal_flange_from_array_mm_deg
+    return transform(
+        rotation_from_euler(*(float(np.radians(a)) for a in (rx, ry, rz))), np.array([x, y, z], dtype=np.float64)
+    )
+
+
+def _nominal_speed_mps(temperature_c: float) -> float:
+    return 331.3 * float(np.sqrt(1 + temperature_c / 273.15))
+
+
+def _provisional(
+    pings: Sequence[Ping], settings: ArraySettings, nominal: Matrix
+) -> tuple[ArrayCalibration, Templates, NDArray[np.float64]]:
+    """Templates from the perpendicular pings, everything else nominal; and the nominal paths (pings, receivers)."""
+    layout = settings.layout
+    emitter, receivers = np.array(layout.emitter_mm), np.array(layout.receivers_mm)
+    poses = np.array([robot_from_flange(p.robot_pose) @ nominal for p in pings])
+    paths = plate_paths(poses, emitter, receivers)
+    chosen = reference_pings(pings, nominal[:3, 2], REFERENCE_MM)
+    first = pings[chosen[0]]
+    speed = 1e3 * _nominal_speed_mps(first.air_temperature_c)
+    path = float(paths[chosen[0]].mean())
+    band = (layout.low_hz, layout.high_hz) if settings.pulse == "wideband" else (36e3, 44e3)
+    cut = cut_templates(pings, chosen, band, (path - GATE_MM) / speed, (path + 2.5 * GATE_MM) / speed)
+    calibration = ArrayCalibration(
+        emitter_mm=layout.emitter_mm,
+        receivers_mm=list(layout.receivers_mm),
+        radius_mm=layout.radius_mm,
+        low_hz=band[0],
+        high_hz=band[1],
+        delays_s=[0.0] * len(receivers),
+        gains=cut.peaks.tolist(),
+        templates=cut.waveforms.astype(np.float64).tolist(),
+        template_origin=(path / speed - first.start_s) * first.sample_rate_hz - cut.first_sample,
+        sample_rate_hz=first.sample_rate_hz,
+        reference_mm=0.5 * path,
+        speed_of_sound_mps=1e-3 * speed,
+        temperature_c=first.air_temperature_c,
+        flange_from_array=nominal.tolist(),
+        rig_from_robot=np.eye(4).tolist(),
+        path_rms_mm=0.0,
+    )
+    return calibration, cut, paths
+
+
+def _times(
+    pings: Sequence[Ping], calibration: ArrayCalibration, paths_mm: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Arrival of the plate's echo after the emission, (pings, receivers)."""
+    pipeline = UltrasonicPipeline(calibration)
+    out = np.full(paths_mm.shape, np.nan)
+    for k, ping in enumerate(pings):
+        gate = (float(paths_mm[k].min()) - GATE_MM, float(paths_mm[k].max()) + GATE_MM)
+        out[k] = pipeline.times_s(ping, gate)
+    return out
+
+
+def calibrate_plate(pings: Sequence[Ping], settings: ArraySettings) -> ArrayResult:
+    """Everything that pings at tilted poses over the plate z = 0 can tell; x, y and yaw of the robot stay nominal.
+
+    Raises
+    ------
+    CalibrationRejectedError
+        Too few pings, no perpendicular one, silent receivers, an undetermined parameter (named), or a bad fit.
+    """
+    if len(pings) < MIN_PINGS:
+        raise CalibrationRejectedError(
+            f"array calibration: the pass 'plate' has {len(pings)} pings, {MIN_PINGS} are needed"
+        )
+    nominal = nominal_flange_from_array(settings)
+    provisional, _, paths = _provisional(pings, settings, nominal)
+    times = _times(pings, provisional, paths)
+    poses = np.array([p.robot_pose for p in pings])
+    temperatures = np.array([p.air_temperature_c for p in pings])
+    emitter, receivers = np.array(provisional.emitter_mm), np.array(provisional.receivers_mm)
+    fit = fit_plate(poses, times, temperatures, emitter, receivers, nominal)
+    good = np.sqrt(np.nanmean(fit.residuals_mm**2, axis=1)) < max(MAX_RMS_MM, 4 * float(np.median(np.abs(fit.residuals_mm))))
+    if np.count_nonzero(good) < MIN_PINGS or np.count_nonzero(good) < 0.7 * len(pings):
+        raise CalibrationRejectedError(
+            f"array calibration: only {int(np.count_nonzero(good))} of {len(pings)} pings fit the plate (rms "
+            f"{fit.path_rms_mm:.2f} mm); is the bench bare and flat, and the nominal mounting of the array right?"
+        )
+    if not good.all():
+        fit = fit_plate(poses[good], times[good], temperatures[good], emitter, receivers, nominal)
+    if fit.path_rms_mm > MAX_RMS_MM:
+        raise CalibrationRejectedError(
+            f"array calibration: paths over the plate scatter by {fit.path_rms_mm:.2f} mm rms, at most {MAX_RMS_MM} is "
+            "accepted; is the bench bare and flat?"
+        )
+    array_pose = fit.rig_from_robot @ robot_from_flange(poses[reference_pings(pings, nominal[:3, 2], REFERENCE_MM)[0]])
+    array_pose = array_pose @ fit.flange_from_array
+    calibration = msgspec.structs.replace(
+        provisional,
+        delays_s=fit.delays_s.tolist(),
+        reference_mm=float((array_pose[:3, :3] @ emitter + array_pose[:3, 3])[2]),
+        speed_of_sound_mps=fit.speed_mps,
+        temperature_c=fit.temperature_c,
+        flange_from_array=fit.flange_from_array.tolist(),
+        rig_from_robot=fit.rig_from_robot.tolist(),
+        path_rms_mm=fit.path_rms_mm,
+    )
+    rejected = [pings[int(k)].trigger for k in np.flatnonzero(~good)]
+    return ArrayResult(calibration, fit, None, int(np.count_nonzero(good)), rejected)
+
+
+def calibrate_array(
+    pings_plate: Sequence[Ping],
+    pings_block: Sequence[Ping],
+    optical_block_points_mm: Points3,
+    settings: ArraySettings,
+) -> ArrayResult:
+    """Calibrate the array completely.
+
+    Parameters
+    ----------
+    pings_plate : pings at perpendicular and tilted poses over the bare bench (`poses.plate_poses`)
+    pings_block : raster over the block (`poses.block_poses`)
+    optical_block_points_mm : (n, 3) float64
+        What light sees of the block and the bench around it, rig frame.
+    settings : ArraySettings
+        Nominal build.
+
+    Raises
+    ------
+    CalibrationRejectedError
+        With the reason, and the name of what stays undetermined.
+    """
+    plate = calibrate_plate(pings_plate, settings)
+    block = fit_block(pings_block, optical_block_points_mm, plate.calibration)
+    calibration = msgspec.structs.replace(plate.calibration, rig_from_robot=block.rig_from_robot.tolist())
+    return ArrayResult(calibration, plate.plate, block, plate.pings_used, plate.pings_rejected)

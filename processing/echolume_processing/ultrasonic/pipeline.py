@@ -1,0 +1,176 @@
+"""One ping in, contact points in the rig frame out; the same for measured and for predicted echoes."""
+
+from __future__ import annotations
+
+import numpy as np
+from echolume_messages.calibration import ArrayCalibration, Calibration
+from echolume_messages.geometry import apply, require_shape, robot_from_flange
+from echolume_messages.types import ULTRASONIC_POINT, EchoBlock, Structured
+from numpy.typing import NDArray
+
+from echolume_processing.ping import Ping
+from echolume_processing.ultrasonic.contact import contact
+from echolume_processing.ultrasonic.envelope import (
+    ComplexEnvelope,
+    MatchedFilter,
+    Waveforms,
+    band_pass,
+    energy,
+    matched_filter,
+    paper_envelope,
+)
+from echolume_processing.ultrasonic.flight import Arrivals, first_arrivals
+
+MIN_PATH_MM = 110.0
+"""Shorter paths drown in the cross-talk and its ringing."""
+MAX_PATH_MM = 900.0
+SURFACE = 0.5
+"""Share of a wide plate's amplitude at the same distance that makes an echo a surface's: half at a straight edge."""
+PATH_FLOOR_MM = 0.05
+"""What the model leaves unexplained of a path on a clean plane."""
+UPSAMPLING = 4
+
+
+def speed_of_sound_mps(calibration: ArrayCalibration, air_temperature_c: float) -> float:
+    """Calibrated speed of sound, carried to another air temperature (ideal gas)."""
+    return calibration.speed_of_sound_mps * float(
+        np.sqrt((air_temperature_c + 273.15) / (calibration.temperature_c + 273.15))
+    )
+
+
+def waveforms_from_counts(echoes: EchoBlock) -> Waveforms:
+    """Digitiser counts (receivers, samples) to float32 without each channel's offset."""
+    require_shape("echoes", echoes, (None, None))
+    floats = echoes.astype(np.float32)
+    return floats - np.median(floats, axis=1, keepdims=True)
+
+
+class UltrasonicPipeline:
+    """The echo chain of one calibrated array.
+
+    Parameters
+    ----------
+    calibration : Calibration or ArrayCalibration
+    surface : float
+        Share of the reference plate's amplitude that counts as the first echo of a surface.
+    """
+
+    def __init__(self, calibration: Calibration | ArrayCalibration, surface: float = SURFACE) -> None:
+        self.calibration = calibration.array if isinstance(calibration, Calibration) else calibration
+        found = self.calibration
+        self._templates = np.array(found.templates, dtype=np.float32)
+        self._delays_s = np.array(found.delays_s, dtype=np.float64)
+        self._emitter_mm = np.array(found.emitter_mm, dtype=np.float64)
+        self._receivers_mm = np.array(found.receivers_mm, dtype=np.float64) - self._emitter_mm
+        self._surface = surface
+        self._banks: dict[int, MatchedFilter] = {}
+        whole = energy(paper_envelope(self._templates, found.sample_rate_hz), found.sample_rate_hz)
+        self._template_energy = np.maximum(whole, np.finfo(np.float64).tiny)
+
+    def process(self, ping: Ping) -> Structured:
+        """Contact points of one measured ping, ULTRASONIC_POINT (n <= receivers,), rig frame."""
+        return self.process_echoes(
+            waveforms_from_counts(ping.echoes),
+            ping.robot_pose,
+            ping.sample_rate_hz,
+            ping.start_s,
+            ping.air_temperature_c,
+        )
+
+    def rig_from_array(self, robot_pose: NDArray[np.float64]) -> NDArray[np.float64]:
+        """4x4 pose of the array at a robot pose (x, y, z in mm; rx, ry, rz in rad)."""
+        return self.calibration.robot_pose @ robot_from_flange(robot_pose) @ self.calibration.array_pose
+
+    def compress(self, waveforms: Waveforms, sample_rate_hz: float) -> ComplexEnvelope:
+        """Matched-filter output (receivers, UPSAMPLING * samples), 1 at an echo like the reference plate's."""
+        return self._bank(waveforms.shape[1], sample_rate_hz).compress(waveforms)
+
+    def arrivals(
+        self,
+        waveforms: Waveforms,
+        sample_rate_hz: float,
+        start_s: float,
+        air_temperature_c: float,
+        *,
+        strongest: bool = False,
+        gate_mm: tuple[float, float] = (MIN_PATH_MM, MAX_PATH_MM),
+    ) -> tuple[Arrivals, NDArray[np.float64]]:
+        """Echo of each channel and its path length in mm (receivers,); not a number where there is none."""
+        bank = self._bank(waveforms.shape[1], sample_rate_hz)
+        compressed = bank.compress(waveforms)
+        rate_hz = sample_rate_hz * UPSAMPLING
+        speed = 1e3 * speed_of_sound_mps(self.calibration, air_temperature_c)  # mm/s
+        delay_s = float(self._delays_s.mean())
+        path_mm = np.maximum((np.arange(compressed.shape[1]) / rate_hz + start_s - delay_s) * speed, 1.0)
+        threshold = (self._surface * 2 * self.calibration.reference_mm / path_mm).astype(np.float32)
+        gate = (int(np.searchsorted(path_mm, gate_mm[0])), int(np.searchsorted(path_mm, gate_mm[1])))
+        found = first_arrivals(compressed, bank, rate_hz, gate, threshold, strongest=strongest)
+        return found, (found.time_s + start_s - self._delays_s) * speed
+
+    def times_s(self, ping: Ping, gate_mm: tuple[float, float]) -> NDArray[np.float64]:
+        """Arrival of the strongest echo within a gate of path, after the emission, delay included (receivers,)."""
+        waveforms = waveforms_from_counts(ping.echoes)
+        found, _ = self.arrivals(
+            waveforms, ping.sample_rate_hz, ping.start_s, ping.air_temperature_c, strongest=True, gate_mm=gate_mm
+        )
+        return found.time_s + ping.start_s
+
+    def process_echoes(
+        self,
+        waveforms: Waveforms,
+        robot_pose: NDArray[np.float64],
+        sample_rate_hz: float,
+        start_s: float,
+        air_temperature_c: float,
+    ) -> Structured:
+        """Contact points of echoes as float32 counts (receivers, samples): measured, or predicted from a surface.
+
+        Returns
+        -------
+        ULTRASONIC_POINT (n,)
+            In the rig frame, one per receiver that the ping's model rests on; `energy` is that below the paper's
+            envelope relative to the reference plate, `lobes` counts the matched filter's echoes.
+        """
+        require_shape("waveforms", waveforms, (len(self._receivers_mm), None))
+        speed = 1e3 * speed_of_sound_mps(self.calibration, air_temperature_c)
+        found, paths_mm = self.arrivals(waveforms, sample_rate_hz, start_s, air_temperature_c)
+        sigma_mm = np.hypot(PATH_FLOOR_MM, np.nan_to_num(found.sigma_s * speed))
+        result = contact(self._receivers_mm, paths_mm, sigma_mm)
+        pose = self.rig_from_array(robot_pose)
+        used = np.flatnonzero(result.used)
+        points = apply(pose, result.points_mm[used] + self._emitter_mm)
+        normals = result.normals[used] @ pose[:3, :3].T
+        out: Structured = np.zeros(len(used), dtype=ULTRASONIC_POINT)
+        for name, values in zip(("x_mm", "y_mm", "z_mm"), points.T, strict=True):
+            out[name] = values
+        for name, values in zip(("nx", "ny", "nz"), normals.T, strict=True):
+            out[name] = values
+        out["sigma_mm"] = 0.5 * sigma_mm[used]
+        out["path_mm"] = paths_mm[used]
+        out["energy"] = self._energy(waveforms, sample_rate_hz, start_s, speed)[used]
+        out["lobes"] = found.lobes[used]
+        out["receiver"] = used
+        out["kind"] = result.kind
+        return out
+
+    def _bank(self, samples: int, sample_rate_hz: float) -> MatchedFilter:
+        found = self.calibration
+        if abs(sample_rate_hz - found.sample_rate_hz) > 1e-6 * found.sample_rate_hz:
+            raise ValueError(f"the array was calibrated at {found.sample_rate_hz} Hz, these echoes have {sample_rate_hz}")
+        if samples not in self._banks:
+            self._banks[samples] = matched_filter(
+                self._templates,
+                found.template_origin,
+                sample_rate_hz,
+                (found.low_hz, found.high_hz),
+                samples,
+                upsampling=UPSAMPLING,
+            )
+        return self._banks[samples]
+
+    def _energy(
+        self, waveforms: Waveforms, sample_rate_hz: float, start_s: float, speed: float
+    ) -> NDArray[np.float64]:
+        first = max(0, int((MIN_PATH_MM / speed - start_s) * sample_rate_hz))
+        passed = band_pass(waveforms[:, first:], sample_rate_hz, self.calibration.low_hz, self.calibration.high_hz)
+        return energy(paper_envelope(passed, sample_rate_hz), sample_rate_hz) / self._template_energy

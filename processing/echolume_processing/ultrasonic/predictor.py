@@ -1,0 +1,113 @@
+"""A small echo predictor for the calibration block: the plate's mirror image, less the floor under the block, plus
+its top as Kirchhoff facets. No shadow, no double bounce."""
+
+from __future__ import annotations
+
+import numpy as np
+from echolume_messages.calibration import ArrayCalibration
+from echolume_messages.geometry import Points3
+from numpy.typing import NDArray
+from scipy import fft
+from scipy.special import j1
+
+from echolume_processing.ultrasonic.envelope import Waveforms
+
+OVERSAMPLING = 8
+
+
+def _directivity(sine: NDArray[np.float64], ka: float) -> NDArray[np.float64]:
+    x = np.maximum(ka * sine, 1e-6)
+    return 2 * j1(x) / x
+
+
+class BlockPredictor:
+    """Predicts the echoes of a plate at z = 0 with raised facets on it.
+
+    Parameters
+    ----------
+    calibration : ArrayCalibration
+    centres_mm : (facets, 3) float64
+        Centres of the raised, horizontal facets, rig frame.
+    area_mm2 : float
+        Of each facet.
+    """
+
+    def __init__(self, calibration: ArrayCalibration, centres_mm: Points3, area_mm2: float, samples: int) -> None:
+        found = self._calibration = calibration
+        self._centres_mm = centres_mm
+        self._area_mm2 = area_mm2
+        self._samples = samples
+        self._rate_hz = found.sample_rate_hz
+        self._length = fft.next_fast_len(samples + len(found.templates[0]), real=True)
+        self._frequency_hz = np.fft.rfftfreq(self._length, 1 / self._rate_hz)
+        spectrum = np.asarray(fft.rfft(np.array(found.templates), self._length, axis=1))
+        origin_s = found.template_origin / self._rate_hz
+        phase = np.exp(2j * np.pi * self._frequency_hz * (origin_s + np.array(found.delays_s)[:, None] * -1))
+        self._source = spectrum * phase * 2 * found.reference_mm
+        self._emitter_mm = np.array(found.emitter_mm)
+        self._receivers_mm = np.array(found.receivers_mm)
+
+    def predict(self, rig_from_array: NDArray[np.float64], start_s: float, speed_mps: float) -> Waveforms:
+        """Echoes at one array pose (4, 4), float32 counts (receivers, samples)."""
+        speed = 1e3 * speed_mps
+        centre_hz = 0.5 * (self._calibration.low_hz + self._calibration.high_hz)
+        ka = 2 * np.pi * centre_hz / speed * self._calibration.radius_mm
+        rotation, place = rig_from_array[:3, :3], rig_from_array[:3, 3]
+        emitter = rotation @ self._emitter_mm + place
+        receivers = self._receivers_mm @ rotation.T + place
+        axis = rotation[:, 2]
+        response = self._image(emitter, receivers, axis, ka, speed, start_s)
+        if len(self._centres_mm):
+            floor = self._centres_mm * np.array([1.0, 1.0, 0.0])
+            response = response + self._facets(self._centres_mm, emitter, receivers, axis, ka, speed, start_s)
+            response = response - self._facets(floor, emitter, receivers, axis, ka, speed, start_s)
+        out: Waveforms = np.asarray(fft.irfft(self._source * response, self._length, axis=1), dtype=np.float32)
+        return out[:, : self._samples]
+
+    def _image(
+        self,
+        emitter: NDArray[np.float64],
+        receivers: Points3,
+        axis: NDArray[np.float64],
+        ka: float,
+        speed: float,
+        start_s: float,
+    ) -> NDArray[np.complex128]:
+        image = emitter * np.array([1.0, 1.0, -1.0])
+        way = receivers - image
+        path = np.linalg.norm(way, axis=1)
+        sine_in = np.sqrt(np.maximum(1 - (way @ axis / path) ** 2, 0.0))
+        out_way = way * np.array([1.0, 1.0, -1.0])
+        sine_out = np.sqrt(np.maximum(1 - (out_way @ axis / path) ** 2, 0.0))
+        level = _directivity(sine_in, ka) * _directivity(sine_out, ka) / path
+        return level[:, None] * np.exp(-2j * np.pi * self._frequency_hz * (path / speed - start_s)[:, None])
+
+    def _facets(
+        self,
+        centres: Points3,
+        emitter: NDArray[np.float64],
+        receivers: Points3,
+        axis: NDArray[np.float64],
+        ka: float,
+        speed: float,
+        start_s: float,
+    ) -> NDArray[np.complex128]:
+        down = centres - emitter
+        there = np.linalg.norm(down, axis=1)
+        level_out = _directivity(np.sqrt(np.maximum(1 - (down @ axis / there) ** 2, 0.0)), ka) / there
+        bins = self._length * OVERSAMPLING
+        rate = self._rate_hz * OVERSAMPLING
+        rows: list[NDArray[np.float64]] = []
+        for receiver in receivers:
+            up = receiver - centres
+            back = np.linalg.norm(up, axis=1)
+            level_in = _directivity(np.sqrt(np.maximum(1 - (up @ axis / back) ** 2, 0.0)), ka) / back
+            obliquity = 0.5 * (np.abs(down[:, 2]) / there + np.abs(up[:, 2]) / back)
+            weight = level_out * level_in * obliquity * (self._area_mm2 / (2 * np.pi * speed))
+            at = ((there + back) / speed - start_s) * rate
+            whole = at.astype(np.int64)
+            part = at - whole
+            row = np.bincount(whole, weight * (1 - part), bins)[:bins]
+            rows.append(row + np.bincount(whole + 1, weight * part, bins)[:bins])
+        spectrum = np.asarray(fft.rfft(np.array(rows), axis=1))[:, : len(self._frequency_hz)]
+        return spectrum * (2j * np.pi * self._frequency_hz)

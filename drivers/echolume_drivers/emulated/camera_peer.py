@@ -73,7 +73,9 @@ class CameraPeer:
     """
 
     def __init__(self, stage: Stage, side: Side, truth: OpticalTruth) -> None:
-        self.stage, self.side, self.truth = stage, side, truth
+        self.stage = stage
+        self.side: Side = side
+        self.truth = truth
         camera = truth.camera(side)
         self._features = {
             "DeviceModelName": "echolume emulated camera",

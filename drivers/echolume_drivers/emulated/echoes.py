@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import irfft, rfft
 from scipy.ndimage import maximum_filter
 
 from echolume_drivers.emulated import transducer
@@ -56,6 +55,14 @@ def surface_of(scene: Scene) -> Surface:
     return found
 
 
+def _frequencies_hz(array: ArraySettings) -> NDArray[np.float64]:
+    return np.arange(array.samples // 2 + 1, dtype=np.float64) * (array.sample_rate_hz / array.samples)
+
+
+def _in_time(spectra: NDArray[np.complex128], samples: int) -> NDArray[np.float64]:
+    return np.fft.irfft(spectra, n=samples, axis=1)
+
+
 def _element_paths(array: ArraySettings) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     elements = np.array([array.layout.emitter_mm, *array.layout.receivers_mm], dtype=np.float64)
     return elements, np.linalg.norm(elements[1:] - elements[0], axis=1)
@@ -103,29 +110,29 @@ def echo_waveforms(
         (FADE_FROM_TAN * height_mm, FADE_TO_TAN * height_mm),
         bin_mm, array.start_s * speed_mps * 1e3, history,
     )  # fmt: skip
-    f_hz = np.arange(array.samples // 2 + 1) * (fine_hz / bins)
+    f_hz = _frequencies_hz(array)
     weights = transducer.band_weights(f_hz, bands_hz)
     # mean loss of spreading each delta over two bins
     weights = weights / (1 - (2 * np.pi * f_hz / fine_hz) ** 2 / 12)
-    spectrum = np.einsum("rfb,bf->rf", rfft(history, axis=1)[:, : len(f_hz)], weights)
+    spectrum = np.einsum("rfb,bf->rf", np.fft.rfft(history, axis=1)[:, : len(f_hz)], weights)
     pulses = transducer.channel_spectra(array, truth, f_hz)
     wavenumber = 2 * np.pi * f_hz / (speed_mps * 1e3)
     scale = REFERENCE_COUNTS * REFERENCE_PATH_MM * array.sample_rate_hz
-    far = irfft(1j * wavenumber * spectrum * pulses, n=array.samples, axis=1)
-    near = irfft(spectrum * pulses, n=array.samples, axis=1)
+    far = _in_time(1j * wavenumber * spectrum * pulses, array.samples)
+    near = _in_time(spectrum * pulses, array.samples)
     t_s = array.start_s + np.arange(array.samples) / array.sample_rate_hz - truth.delays_s[:, None]
     echo = scale * (far + near * 2 / np.maximum(t_s * speed_mps * 1e3, 20.0))
     arrival_s = direct_mm[:, None] / (speed_mps * 1e3) - array.start_s
     talk = truth.cross_talk[:, None] * pulses * np.exp(-2j * np.pi * f_hz * arrival_s)
-    direct = irfft(talk, n=array.samples, axis=1) if array.start_s == 0 else np.zeros_like(echo)
+    direct = _in_time(talk, array.samples) if array.start_s == 0 else np.zeros_like(echo)
     return echo + REFERENCE_COUNTS * array.sample_rate_hz * direct
 
 
 def noise_counts(array: ArraySettings, truth: ArrayTruth) -> float:
     """Rms of the white noise that gives `truth.snr_db` after a matched filter over a plate at 150 mm."""
-    f_hz = np.fft.rfftfreq(array.samples, 1 / array.sample_rate_hz)
+    f_hz = _frequencies_hz(array)
     pulses = transducer.channel_spectra(array, truth, f_hz) / truth.gains[:, None]
-    pulse = REFERENCE_COUNTS * array.sample_rate_hz * irfft(pulses, n=array.samples, axis=1)
+    pulse = REFERENCE_COUNTS * array.sample_rate_hz * _in_time(pulses, array.samples)
     root_energy = float(np.sqrt(np.mean(np.sum(pulse**2, axis=1))))
     return root_energy / 10 ** (truth.snr_db / 20)
 
@@ -150,9 +157,9 @@ def simulate_ping(
     # the speed goes with the root of the temperature
     warm_k = 2 * (273.15 + temperature_c) * rng.normal(0, truth.air_sigma)
     clean = echo_waveforms(scene, jittered, array, truth, temperature_c + warm_k)
-    f_hz = np.fft.rfftfreq(array.samples, 1 / array.sample_rate_hz)
+    f_hz = _frequencies_hz(array)
     shift_s = rng.normal(0, truth.timing_sigma_s, (n, 1))
     level = 1 + rng.normal(0, truth.amplitude_sigma)
-    moved = level * irfft(rfft(clean, axis=1) * np.exp(-2j * np.pi * f_hz * shift_s), n=array.samples, axis=1)
+    moved = level * _in_time(np.fft.rfft(clean, axis=1) * np.exp(-2j * np.pi * f_hz * shift_s), array.samples)
     noisy = moved + rng.normal(0, noise_counts(array, truth), moved.shape)
     return np.clip(np.rint(noisy), -32768, 32767).astype(np.int16)

@@ -77,7 +77,7 @@ def _bench(scene: Scene) -> NDArray[np.float64]:
 def _walls(heights: NDArray[np.float64], cell: float, merge: int) -> NDArray[np.float64]:
     """Walls between columns; rows: boundary index, centre along it, z, sign, length, slice height, floor."""
     rows: list[tuple[float, ...]] = []
-    n_rows, n_columns = heights.shape
+    n_rows = heights.shape[0]
     padded = np.pad(heights, ((0, 0), (1, 1)))
     step = np.abs(np.diff(padded, axis=1)) > WALL_MM  # (rows, columns + 1)
     for b in np.nonzero(step.any(axis=0))[0].tolist():

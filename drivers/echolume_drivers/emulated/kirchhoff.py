@@ -125,8 +125,9 @@ def accumulate(
 ) -> None:
     """Add every facet's echo to `history` (receivers, bins, BANDS).
 
-    `elements` (1 + receivers, 3) are emitter and receivers in the rig frame, `axis` (3,) their direction, `reach`
-    the lateral distance in mm from where facets fade to where they end, `wavenumbers` (BANDS,) in 1/mm; `radius` in mm of the pistons.
+    `elements` (1 + receivers, 3) are emitter and receivers in the rig frame, `axis` (3,) their direction, `radius`
+    that of the pistons, `reach` the lateral distances where facets begin to fade and where they end, all in mm;
+    `wavenumbers` (BANDS,) in 1/mm.
     """
     receivers = elements.shape[0] - 1
     bins = history.shape[1]

@@ -54,21 +54,21 @@ def band_weights(frequencies_hz: NDArray[np.float64], bands_hz: NDArray[np.float
 
 def _resonator(frequencies_hz: NDArray[np.float64], centre_hz: float, quality: float) -> NDArray[np.complex128]:
     f = np.maximum(frequencies_hz, 1.0)
-    return 1 / (1 + 1j * quality * (f / centre_hz - centre_hz / f))
+    return np.asarray(1 / (1 + 1j * quality * (f / centre_hz - centre_hz / f)), dtype=np.complex128)
 
 
 def _burst(frequencies_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
     length_s = CYCLES / CARRIER_HZ
     t_s = (np.arange(2048) + 0.5) * length_s / 2048
     wave = np.sin(2 * np.pi * CARRIER_HZ * t_s) * (length_s / 2048)
-    return np.exp(-2j * np.pi * frequencies_hz[:, None] * t_s) @ wave
+    return np.asarray(np.exp(-2j * np.pi * frequencies_hz[:, None] * t_s) @ wave, dtype=np.complex128)
 
 
 def _band(frequencies_hz: NDArray[np.float64], low_hz: float, high_hz: float) -> NDArray[np.float64]:
     """Band with raised-cosine edges 10 kHz wide, -6 dB at its limits."""
     rise = np.clip((frequencies_hz - (low_hz - 5e3)) / 10e3, 0, 1)
     fall = np.clip(((high_hz + 5e3) - frequencies_hz) / 10e3, 0, 1)
-    return np.sin(np.pi / 2 * rise) ** 2 * np.sin(np.pi / 2 * fall) ** 2
+    return np.asarray(np.sin(np.pi / 2 * rise) ** 2 * np.sin(np.pi / 2 * fall) ** 2, dtype=np.float64)
 
 
 def channel_spectra(

@@ -102,9 +102,8 @@ class CamerasService:
         for eye in self._eyes:
             service.thread(eye.topic.stream, lambda _loop, eye=eye: self._read(eye), 10.0)
         service.thread("deadlines", self._deadlines, 5.0)
-        service.serve(
-            {"begin": self._begin, "arm": self._arm, "disarm": self._disarm, "status": self._status}, _COMMAND_LIMIT_S
-        )
+        service.serve({"begin": self._begin, "arm": self._arm}, _COMMAND_LIMIT_S)
+        service.serve({"disarm": self._disarm, "status": self._status}, _COMMAND_LIMIT_S)
 
     def health(self) -> Json:
         """Device states, awaited frames and publishing queues."""
@@ -242,7 +241,9 @@ class CamerasService:
             out["scan"] = self._scan
             out["missing"] = [[e.topic.name, m.trigger, m.attempt] for e in self._eyes for m in e.missing]
             out["revoked"] = [[e.topic.name, m.trigger, m.attempt] for e in self._eyes for m in e.matcher.revoked]
-            out["counts"] = [[e.topic.name, name, kind, n] for e in self._eyes for (name, kind), n in e.counts.items()]
+            out["counts"] = [
+                [name, kind, n] for (name, kind), n in sum((e.counts for e in self._eyes), Counter()).items()
+            ]
         return out
 
     # -- loops

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from typing import Generic, Protocol, TypeVar
 
@@ -83,7 +83,7 @@ class Slot(Generic[D]):
         return {"state": state, "error": self._error}
 
     @contextmanager
-    def use(self) -> Iterator[D]:
+    def use(self) -> Generator[D]:
         """Hold the device for one operation.
 
         Raises
@@ -131,7 +131,9 @@ class Slot(Generic[D]):
         if self._device is None:
             if now_s >= self._next_s and not self._closed:
                 self._try_open(now_s)
-        elif self._probe is not None and (self._suspect or now_s >= self._next_s) and self._lock.acquire(blocking=False):
+        elif (
+            self._probe is not None and (self._suspect or now_s >= self._next_s) and self._lock.acquire(blocking=False)
+        ):
             try:
                 self._ask(self._probe, now_s)
             finally:

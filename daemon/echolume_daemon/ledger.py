@@ -43,6 +43,7 @@ class Ledger:
     _fired: set[tuple[int, int]] = field(default_factory=set[tuple[int, int]], init=False)
     _seen: Counter[Expected] = field(default_factory=Counter[Expected], init=False)
     _lost: set[Expected] = field(default_factory=set[Expected], init=False)
+    _revoked: set[Expected] = field(default_factory=set[Expected], init=False)
     _open: set[Expected] = field(default_factory=set[Expected], init=False)
     _matched: dict[int, int] = field(default_factory=dict[int, int], init=False)
     _reported: Counter[tuple[str, str]] = field(default_factory=Counter[tuple[str, str]], init=False)
@@ -84,7 +85,8 @@ class Ledger:
         if trigger not in self._steps:
             return
         self._fired.add((trigger, attempt))
-        self._open |= {e for e in self._expected(trigger, attempt) if not self._seen[e] and e not in self._lost}
+        gone = self._lost | self._revoked
+        self._open |= {e for e in self._expected(trigger, attempt) if not self._seen[e] and e not in gone}
         self._match(trigger, attempt)
 
     def durable(self, topic: str, trigger: int, attempt: int) -> None:
@@ -103,6 +105,17 @@ class Ledger:
         if not self._seen[key]:
             self._lost.add(key)
         self._open.discard(key)
+
+    def revoked(self, topic: str, trigger: int, attempt: int) -> None:
+        """A published record may belong to another trigger: it counts as extra, and its own is missing."""
+        key = Expected(topic, trigger, attempt)
+        if key in self._revoked:
+            return
+        self._revoked.add(key)
+        self._open.discard(key)
+        self._matched.pop(trigger, None)
+        for other in sorted({a for t, a in self._fired if t == trigger}):
+            self._match(trigger, other)
 
     def reported(self, pass_name: str, kind: Literal["duplicate", "extra"], count: int) -> None:
         """A device received `count` records in a pass that it did not publish (total so far)."""
@@ -160,7 +173,9 @@ class Ledger:
         return (Expected(t.name, trigger, attempt) for t in PASS_STREAMS[self._steps[trigger].kind])
 
     def _match(self, trigger: int, attempt: int) -> None:
-        if (trigger, attempt) not in self._fired or not all(self._seen[e] for e in self._expected(trigger, attempt)):
+        if (trigger, attempt) not in self._fired or not all(
+            self._seen[e] and e not in self._revoked for e in self._expected(trigger, attempt)
+        ):
             return
         self._matched[trigger] = min(attempt, self._matched.get(trigger, attempt))
 
@@ -170,9 +185,10 @@ class Ledger:
         fired = sorted(f for f in self._fired if f[0] in triggers)
         expected = {e for trigger, attempt in fired for e in self._expected(trigger, attempt)}
         seen = {key: n for key, n in self._seen.items() if key.trigger in triggers and n}
-        matched = sum(key in expected for key in seen)
-        duplicate = sum(n - 1 for key, n in seen.items() if key in expected) + self._reported[name, "duplicate"]
-        extra = sum(n for key, n in seen.items() if key not in expected) + self._reported[name, "extra"]
+        valid = expected - self._revoked
+        matched = sum(key in valid for key in seen)
+        duplicate = sum(n - 1 for key, n in seen.items() if key in valid) + self._reported[name, "duplicate"]
+        extra = sum(n for key, n in seen.items() if key not in valid) + self._reported[name, "extra"]
         missing = sorted(triggers - self._matched.keys())
         return {
             "kind": steps[0].kind,

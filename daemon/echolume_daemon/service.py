@@ -1,4 +1,4 @@
-"""The frame of every service: signals, bus, liveliness token, health, sd_notify, and a watchdog that asks every loop."""
+"""The frame of every service: signals, bus, liveliness token, health, and a watchdog that asks every loop."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -57,7 +57,7 @@ class Loop:
         return 0.0 if due_s is None else max(0.0, self.now_s() - due_s)
 
     @contextmanager
-    def working(self, within_s: float | None = None) -> Iterator[None]:
+    def working(self, within_s: float | None = None) -> Generator[None]:
         """Owe an answer while the block runs."""
         self.answer(within_s)
         try:
@@ -122,8 +122,11 @@ class Service:
         made.start()
 
     def serve(self, commands: Mapping[str, Handler], limit_s: float = 30.0) -> None:
-        """Answer commands; while one is worked on, the watchdog waits for it at most `limit_s`."""
-        loop = self.loop("commands", limit_s)
+        """Answer commands, one after the other; while one is worked on, the watchdog waits for it at most `limit_s`.
+
+        Each call answers in a thread of its own: what must get through at once goes into a call of its own.
+        """
+        loop = self.loop("commands " + "/".join(commands), limit_s)
 
         def watched(handler: Handler) -> Handler:
             def handle(body: Json) -> Json:
@@ -182,16 +185,13 @@ def run_service(
     rig = rig or load_rig()
     stop = stop or threading.Event()
     with _signals(stop):
-        own = None
-        if bus is None:
-            own = bus = _connect(name, rig, stop)
-            if own is None:
-                return 0
-        try:
+        if bus is not None:
             return _run(Service(name, rig, bus, stop), make)
-        finally:
-            if own is not None:
-                own.close()
+        own = _connect(name, rig, stop)
+        if own is None:
+            return 0
+        with own:
+            return _run(Service(name, rig, own, stop), make)
 
 
 def _run(service: Service, make: Callable[[Service], Part]) -> int:
@@ -263,7 +263,7 @@ def _connect(name: str, rig: Rig, stop: threading.Event) -> Bus | None:
 
 
 @contextmanager
-def _signals(stop: threading.Event) -> Iterator[None]:
+def _signals(stop: threading.Event) -> Generator[None]:
     """SIGTERM and SIGINT set `stop`; only the main thread may install handlers."""
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -1,0 +1,291 @@
+"""Fires the triggers of a scan through the services, and keeps its ledger."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import TypeAlias, cast
+
+from echolume_daemon.ledger import Expected, Ledger
+from echolume_messages.bus import Bus
+from echolume_messages.errors import DeviceAbsentError, EcholumeError, NoReplyError, ScanError
+from echolume_messages.plan import Step
+from echolume_messages.rig import Rig
+from echolume_messages.topics import CAMERA_LEFT, CAMERA_RIGHT, ECHOES, PASS_STREAMS
+
+Json: TypeAlias = dict[str, object]
+
+SERVICES_OF = {"snap": ("cameras",), "optical": ("guide", "cameras"), "ultrasonic": ("robot", "array")}
+"""Services that a pass of a kind needs, besides the recorder."""
+HELD_SHARE = 0.8
+"""Unacknowledged records may fill this share of the journal; then the next trigger waits."""
+HELD_LIMIT_S = 15.0
+READY_S = 8.0
+DRAIN_S = 8.0
+ERRORS_IN_A_ROW = 3
+_log = logging.getLogger("echolume.acquisition")
+
+
+class Interrupted(Exception):
+    """The scan is to end now."""
+
+
+@dataclass
+class Acquisition:
+    """One scan's way through the services.
+
+    `gate` is called at every trigger boundary; it waits while the scan is paused and raises `Interrupted` when the
+    scan is to end.
+    """
+
+    bus: Bus
+    rig: Rig
+    scan: str
+    calibration: str
+    ledger: Ledger
+    gate: Callable[[], None]
+    changed: threading.Condition = field(default_factory=threading.Condition)
+    durable_seq: dict[str, int] = field(default_factory=dict[str, int])
+    _fired_s: dict[tuple[int, int], float] = field(default_factory=dict[tuple[int, int], float])
+    _errors: int = 0
+    _revoked: set[Expected] = field(default_factory=set[Expected])
+    _next_ask_s: float = 0.0
+
+    # -- what the recorder says
+
+    def durable(self, message: Json) -> None:
+        """Take in a ``recorder/durable`` message."""
+        if message.get("scan") != self.scan:
+            return
+        with self.changed:
+            self.durable_seq.update(cast("dict[str, int]", message.get("durable", {})))
+            for topic, trigger, attempt, _seq in cast("list[tuple[str, int, int, int]]", message.get("records", [])):
+                self.ledger.durable(topic, trigger, attempt)
+            self.changed.notify_all()
+
+    # -- before the scan, and after a service came back
+
+    def check(self, kinds: Iterable[str], wait_s: float = READY_S) -> None:
+        """Wait until every service that the passes need is alive and its devices are there.
+
+        Raises
+        ------
+        NoReplyError
+            Services that are not running, by name.
+        DeviceAbsentError
+            Devices that are not there, each with its own error.
+        """
+        names = sorted({name for kind in kinds for name in SERVICES_OF[kind]} | {"recorder"})
+        deadline_s = time.monotonic() + wait_s
+        while True:
+            dead = [name for name in names if name not in self.bus.alive()]
+            ill = [] if dead else [text for name in names for text in self._ill(name)]
+            if not dead and not ill:
+                return
+            if time.monotonic() > deadline_s:
+                if dead:
+                    raise NoReplyError(f"not running: {', '.join(dead)}; start them with `echolume serve NAME`")
+                raise DeviceAbsentError("; ".join(ill))
+            with self.changed:
+                self.changed.wait(0.1)
+
+    def _ill(self, name: str) -> list[str]:
+        devices = cast("dict[str, Json]", self._ask(name, "status", {}).get("devices", {}))
+        return [f"{key}: {d.get('error')}" for key, d in devices.items() if d.get("state") == "absent"]
+
+    def prepare(self, kind: str) -> None:
+        """Bring the devices of a kind of pass to their starting state."""
+        for name in SERVICES_OF[kind]:
+            if name == "guide" and not self._ask("guide", "status", {}).get("homed"):
+                self._ask("guide", "home", {}, 90.0)
+            elif name == "cameras" and self._ask("cameras", "status", {}).get("scan") != self.scan:
+                self._ask("cameras", "begin", {"scan": self.scan, "calibration": self.calibration})
+            elif name == "robot" and not self._ask("robot", "status", {}).get("enabled"):
+                self._ask("robot", "enable", {}, 30.0)
+
+    # -- the passes
+
+    def run(self, steps: list[Step]) -> None:
+        """Acquire steps; each failure only loses its own trigger, unless the device stays away."""
+        for step in steps:
+            self.gate()
+            self._await_room(step)
+            self._attempt(step)
+
+    def drain(self, pass_name: str) -> list[Step]:
+        """Wait until every fired record of a pass is durable or given up; returns the steps that are missing."""
+        names = {s.trigger for s in self.ledger.steps if s.pass_name == pass_name}
+        deadline_s = time.monotonic() + DRAIN_S
+        before = -1
+        while left := [e for e in self._open() if e.trigger in names]:
+            self.gate()
+            self._ask_for_missing()
+            if len(left) != before:
+                before, deadline_s = len(left), time.monotonic() + DRAIN_S
+            elif time.monotonic() > deadline_s:
+                _log.warning("%s: given up after %.0f s: %s", pass_name, DRAIN_S, _named(left))
+                self._lose(left)
+            with self.changed:
+                self.changed.wait(0.05)
+        self._ask_for_missing(at_once=True)
+        with self.changed:
+            return self.ledger.missing(pass_name)
+
+    def _attempt(self, step: Step) -> None:
+        with self.changed:
+            attempt = self.ledger.next_attempt(step.trigger)
+            self.ledger.fired(step.trigger, attempt)
+            self._fired_s[step.trigger, attempt] = time.monotonic()
+        try:
+            if step.kind == "ultrasonic":
+                self._ping(step, attempt)
+            else:
+                self._frame(step, attempt)
+        except EcholumeError as error:
+            self._lose(Expected(t.name, step.trigger, attempt) for t in PASS_STREAMS[step.kind])
+            self.gate()
+            self._errors += 1
+            _log.warning("%s: trigger %d (attempt %d): %s", step.pass_name, step.trigger, attempt, error)
+            if self._errors >= ERRORS_IN_A_ROW:
+                raise
+            self.check([step.kind])
+            self.prepare(step.kind)
+        else:
+            self._errors = 0
+
+    def _frame(self, step: Step, attempt: int) -> None:
+        optical = step.guide_x_mm is not None
+        body: Json = {
+            "trigger": step.trigger,
+            "pass": step.pass_name,
+            "attempt": attempt,
+            "exposure_s": step.exposure_s,
+            "external": optical,
+            "x_mm": step.guide_x_mm,
+            "sigma_mm": self.rig.guide.position_sigma_mm,
+            "laser_on": optical,
+        }
+        self._ask("cameras", "arm", body, 10.0)
+        if not optical:
+            return
+        try:
+            self._ask("guide", "expose", {"x_mm": step.guide_x_mm, "exposure_s": step.exposure_s}, 20.0)
+        except EcholumeError:
+            self._quietly("cameras", "disarm")
+            raise
+
+    def _ping(self, step: Step, attempt: int) -> None:
+        reached = self._ask("robot", "move", {"pose": step.pose}, 60.0)
+        body: Json = {
+            "scan": self.scan,
+            "pass": step.pass_name,
+            "trigger": step.trigger,
+            "attempt": attempt,
+            "robot_pose": reached["pose"],
+            "pose_sigma_mm": reached["sigma_mm"],
+            "calibration": self.calibration,
+        }
+        self._ask("array", "ping", body, 10.0)
+
+    # -- back-pressure and losses
+
+    def _await_room(self, step: Step) -> None:
+        """Hold the trigger while what is not yet acknowledged fills most of the journal."""
+        needed = sum(self._bytes(t.name) for t in PASS_STREAMS[step.kind])
+        limit = HELD_SHARE * self.rig.bus.journal_mib * 2**20
+        deadline_s = time.monotonic() + HELD_LIMIT_S
+        while waiting := self._open():
+            held = sum(self._bytes(e.topic) for e in waiting)
+            now_s = time.monotonic()
+            age_s = max(now_s - self._fired_s.get((e.trigger, e.attempt), now_s) for e in waiting)
+            if held + needed <= limit and age_s <= HELD_SHARE * self.rig.bus.journal_s:
+                return
+            self._ask_for_missing()
+            if now_s > deadline_s:
+                raise ScanError(
+                    f"recorder: acknowledged nothing of {_named(waiting)} for {HELD_LIMIT_S:.0f} s; is it running, "
+                    "and is there room on its disk?"
+                )
+            self.gate()
+            with self.changed:
+                self.changed.wait(0.05)
+
+    def _bytes(self, topic: str) -> int:
+        cameras = self.rig.cameras
+        sizes = {
+            CAMERA_LEFT.name: cameras.left.width_px * cameras.left.height_px,
+            CAMERA_RIGHT.name: cameras.right.width_px * cameras.right.height_px,
+            ECHOES.name: 8 * self.rig.array.samples * 2,
+        }
+        return sizes[topic]
+
+    def _open(self) -> frozenset[Expected]:
+        with self.changed:
+            return self.ledger.open
+
+    def _lose(self, records: Iterable[Expected]) -> None:
+        with self.changed:
+            for topic, trigger, attempt in records:
+                self.ledger.lost(topic, trigger, attempt)
+
+    def _ask_for_missing(self, *, at_once: bool = False) -> None:
+        """Learn from the cameras which frames will not come; at most five times a second."""
+        now_s = time.monotonic()
+        if now_s < self._next_ask_s and not at_once:
+            return
+        self._next_ask_s = now_s + 0.2
+        if not any(step.kind != "ultrasonic" for step in self.ledger.steps):
+            return
+        try:
+            status = self._ask("cameras", "status", {}, 2.0)
+        except EcholumeError as error:
+            _log.warning("cameras: %s", error)
+            return
+        if status.get("scan") != self.scan:
+            return
+        with self.changed:
+            for topic, trigger, attempt in cast("list[tuple[str, int, int]]", status.get("missing", [])):
+                self.ledger.lost(topic, trigger, attempt)
+            for topic, trigger, attempt in cast("list[tuple[str, int, int]]", status.get("revoked", [])):
+                self.ledger.revoked(topic, trigger, attempt)
+            for name, kind, count in cast("list[tuple[str, str, int]]", status.get("counts", [])):
+                if kind in ("duplicate", "extra"):
+                    self.ledger.reported(name, kind, count)
+
+    # -- commands
+
+    def _ask(self, service: str, command: str, body: Json, timeout_s: float = 5.0) -> Json:
+        return self.bus.request(service, command, body, timeout_s)
+
+    def _quietly(self, service: str, command: str, timeout_s: float = 2.0) -> None:
+        """A command whose failure changes nothing about what is done next; it is logged."""
+        try:
+            self._ask(service, command, {}, timeout_s)
+        except EcholumeError as error:
+            _log.warning("%s.%s: %s", service, command, error)
+
+    def make_safe(self, kinds: Iterable[str], *, at_once: bool) -> None:
+        """Laser off, trigger unit disarmed; `at_once`: stop guide and robot where they are. All side by side."""
+        wanted = {name for kind in kinds for name in SERVICES_OF[kind]}
+        commands = [("guide", "stop" if at_once else "laser_off"), ("cameras", "disarm")]
+        if at_once:
+            commands.append(("robot", "stop"))
+        threads = [
+            threading.Thread(target=self._quietly, args=pair, name=f"safe-{pair[0]}", daemon=True)
+            for pair in commands
+            if pair[0] in wanted
+        ]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(3.0)
+
+
+def _named(records: Iterable[Expected]) -> str:
+    """A few records by name."""
+    found = sorted(records, key=lambda e: (e.trigger, e.topic))
+    text = ", ".join(f"{e.topic} of trigger {e.trigger}" for e in found[:4])
+    return text + (f" and {len(found) - 4} more" if len(found) > 4 else "")

@@ -1,0 +1,130 @@
+"""Run a scan plan on the rig and wait for its ledger.
+
+Prompts of the plan are shown; Enter goes on. Ctrl-C aborts in good order.
+Exit code 0 if every trigger is matched, 8 if some are missing or the scan was aborted.
+
+example:
+  echolume scan plans/demo.toml --out /var/lib/echolume/tuesday
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import sys
+import threading
+from pathlib import Path
+from types import FrameType
+from typing import cast
+
+from echolume_daemon.client import Json, ScanClient
+from echolume_daemon.commands.options import add_holder, add_rig, join
+from echolume_messages import calibration as calibration_file
+from echolume_messages.errors import ConfigError, IncompleteScanError
+from echolume_messages.rig import Rig
+
+COLUMNS = ("planned", "fired", "matched", "missing", "duplicate", "extra")
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("plan", type=Path, metavar="PLAN", help="scan plan (TOML)")
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="where raw.mcap goes (default: the recorder's directory)"
+    )
+    parser.add_argument("--json", action="store_true", help="print the ledger as JSON")
+    add_rig(parser)
+    add_holder(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Start the scan, follow it, print its ledger."""
+    try:
+        plan_text = args.plan.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{args.plan}: cannot read the plan: {error.strerror}") from error
+    rig, bus = join(args.rig)
+    archive = _archive(args.out)
+    stop = threading.Event()
+    with bus:
+        client = ScanClient(bus, args.holder)
+        before = signal.signal(signal.SIGINT, lambda _n, _f: stop.set())
+        try:
+            scan = client.start(plan_text, archive=archive, calibration=_calibration(rig))
+            sys.stderr.write(f"scan {scan}\n")
+            ledger = client.wait(Progress().show, lambda text: _ask(text, stop), stop)
+        finally:
+            signal.signal(signal.SIGINT, before)
+    sys.stdout.write(json.dumps(ledger, indent=1) + "\n" if args.json else table(ledger))
+    if ledger["outcome"] == "complete":
+        return 0
+    raise IncompleteScanError(f"scan {scan}: {ledger['outcome']}; {_missing(ledger)}")
+
+
+def _archive(out: Path | None) -> str:
+    if out is None:
+        return ""
+    out.mkdir(parents=True, exist_ok=True)
+    return str(out.resolve() / "raw.mcap")
+
+
+def _calibration(rig: Rig) -> Json | None:
+    if not rig.calibration:
+        return None
+    path = Path(rig.calibration)
+    calibration_file.load(path, rig.name)
+    return cast(Json, json.loads(path.read_text(encoding="utf-8")))
+
+
+def _ask(text: str, stop: threading.Event) -> None:
+    """Show a prompt; Enter goes on, Ctrl-C aborts."""
+    sys.stderr.write(f"\n{text}\n[Enter goes on, Ctrl-C aborts] ")
+    sys.stderr.flush()
+
+    def interrupt(_number: int, _frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, interrupt)
+    try:
+        sys.stdin.readline()
+    except KeyboardInterrupt:
+        stop.set()
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+class Progress:
+    """Progress on stderr: rewritten in place on a terminal, one line a pass elsewhere."""
+
+    def __init__(self) -> None:
+        self._last: tuple[object, object] = ("", "")
+
+    def show(self, state: Json) -> None:
+        """Show a state of the conductor."""
+        line = f"{state['state']:<9} {state['pass'] or '':<12} {state['matched']}/{state['planned']} matched"
+        if sys.stderr.isatty():
+            sys.stderr.write(f"\r{line:<70}")
+            sys.stderr.flush()
+            return
+        key = (state["state"], state["pass"])
+        if key != self._last:
+            self._last = key
+            sys.stderr.write(line + "\n")
+
+
+def table(ledger: Json) -> str:
+    """The ledger as text."""
+    passes = cast("dict[str, Json]", ledger["passes"])
+    width = max((len(name) for name in passes), default=4)
+    rows = ["  ".join([f"{'pass':<{width}}", f"{'kind':<10}", *(f"{c:>9}" for c in COLUMNS)])]
+    for name, entry in passes.items():
+        rows.append("  ".join([f"{name:<{width}}", f"{entry['kind']:<10}", *(f"{entry[c]:>9}" for c in COLUMNS)]))
+    rows.append(f"outcome: {ledger['outcome']}; {ledger['acknowledged']} records acknowledged in {ledger['archive']}")
+    return "\n".join(rows) + "\n"
+
+
+def _missing(ledger: Json) -> str:
+    passes = cast("dict[str, Json]", ledger["passes"])
+    named = [f"{name}: {entry['missing_triggers']}" for name, entry in passes.items() if entry["missing_triggers"]]
+    return "missing triggers: " + ("; ".join(named) or "none")

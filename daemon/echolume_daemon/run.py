@@ -1,0 +1,160 @@
+"""One scan from arming to the final ledger: the conductor's worker."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import msgspec
+
+from echolume_daemon.acquisition import Acquisition, Interrupted, Json
+from echolume_daemon.ledger import Outcome
+from echolume_daemon.states import Event
+from echolume_messages.bus import Bus, Publisher
+from echolume_messages.errors import EcholumeError
+from echolume_messages.plan import Plan
+from echolume_messages.rig import Rig
+from echolume_messages.topics import LEDGER, SCAN_START
+
+DURABLE_S = 5.0
+_log = logging.getLogger("echolume.run")
+
+
+class Stage(Protocol):
+    """What the worker needs of the conductor."""
+
+    def happen(self, event: Event, *, error: str = "", prompt: str = "") -> None:
+        """Follow the state table."""
+        ...
+
+    def gate(self) -> None:
+        """Wait while paused; raise `Interrupted` when the scan is to end."""
+        ...
+
+    def enter(self, pass_name: str, kind: str) -> None:
+        """A pass begins."""
+        ...
+
+
+@dataclass
+class ScanRun:
+    """A scan under way."""
+
+    bus: Bus
+    rig: Rig
+    scan: str
+    plan: Plan
+    archive: str
+    calibration: Json | None
+    acquisition: Acquisition
+    stage: Stage
+    on_ledger: Callable[[Json], None]
+
+    def __post_init__(self) -> None:
+        self._ledgers: Publisher = self.bus.publisher(LEDGER)
+        self._starts: Publisher = self.bus.publisher(SCAN_START)
+        self.kinds = list(dict.fromkeys(step.kind for step in self.acquisition.ledger.steps))
+
+    def open_archive(self) -> None:
+        """Have the recorder open the archive of this scan.
+
+        Raises
+        ------
+        EcholumeError
+            The recorder cannot: the disk is full, the directory is missing, or it is not running.
+        """
+        body: Json = {"scan": self.scan, "name": self.scan}
+        if self.archive:
+            path = Path(self.archive)
+            body |= {"name": path.name.removesuffix(".mcap"), "directory": str(path.parent)}
+        self.archive = str(self.bus.request("recorder", "open", body, 10.0).get("path", self.archive))
+
+    def run(self) -> None:
+        """Acquire the plan, then close the ledger and the archive, whatever happened."""
+        outcome: Outcome = "failed"
+        try:
+            self._acquire()
+            self.stage.happen(Event.DONE)
+            outcome = "complete" if self.acquisition.ledger.complete() else "incomplete"
+        except Interrupted:
+            outcome = "aborted"
+        except EcholumeError as error:
+            self._fail(str(error))
+        except Exception as error:
+            _log.exception("scan %s", self.scan)
+            self._fail(f"internal error: {error!r}")
+        finally:
+            self._finish(outcome)
+
+    def _acquire(self) -> None:
+        self._starts.put_json(
+            {
+                "scan": self.scan,
+                "plan": msgspec.to_builtins(self.plan),
+                "calibration": self.calibration,
+                "rig": self.rig.name,
+                "array": {k: v for k, v in msgspec.to_builtins(self.rig.array).items() if k != "port"},
+            },
+            scan=self.scan,
+            calibration=self.acquisition.calibration,
+        )
+        for kind in self.kinds:
+            self.acquisition.prepare(kind)
+        self.stage.gate()
+        self.stage.happen(Event.ARMED)
+        for item in self.plan.passes:
+            self._pass(item.name)
+
+    def _pass(self, name: str) -> None:
+        """One pass, and again what is missing of it, as often as the plan allows."""
+        acquisition = self.acquisition
+        missing = acquisition.ledger.missing(name)
+        if not missing:
+            return
+        self.stage.enter(name, missing[0].kind)
+        prompt = next((s.prompt for s in acquisition.ledger.steps if s.pass_name == name and s.prompt), "")
+        if prompt:
+            self.stage.gate()
+            self.stage.happen(Event.PROMPT, prompt=prompt)
+        for _ in range(max(1, self.plan.max_attempts)):
+            acquisition.run(missing)
+            missing = acquisition.drain(name)
+            if not missing:
+                break
+            _log.warning("pass %s: missing triggers %s", name, [s.trigger for s in missing])
+        self._publish("incomplete", final=False)
+
+    def _fail(self, text: str) -> None:
+        _log.error("scan %s: %s", self.scan, text)
+        self.stage.happen(Event.FAIL, error=text)
+
+    def _publish(self, outcome: Outcome, *, final: bool) -> int:
+        with self.acquisition.changed:
+            report = self.acquisition.ledger.report(self.scan, outcome, final=final)
+        report["archive"] = self.archive
+        self.on_ledger(report)
+        return self._ledgers.put_json(report, scan=self.scan)
+
+    def _finish(self, outcome: Outcome) -> None:
+        self.acquisition.make_safe(self.kinds, at_once=False)
+        self._await(lambda: not self.acquisition.ledger.open)
+        seq = self._publish(outcome, final=True)
+        self._await(lambda: self.acquisition.durable_seq.get(LEDGER.name, -1) >= seq)
+        try:
+            self.bus.request("recorder", "close", {"scan": self.scan}, 15.0)
+        except EcholumeError as error:
+            _log.error("closing the archive of %s: %s", self.scan, error)
+        self.stage.happen(Event.CLOSED)
+
+    def _await(self, done: Callable[[], bool]) -> None:
+        """Wait until the recorder has caught up, for at most `DURABLE_S`."""
+        changed: threading.Condition = self.acquisition.changed
+        deadline_s = time.monotonic() + DURABLE_S
+        with changed:
+            while not done() and time.monotonic() < deadline_s:
+                changed.wait(0.05)

@@ -11,7 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, cast
 
 import serial
 
@@ -45,7 +45,7 @@ class GrblLink:
     def __init__(self, name: str, port: str, baud: int) -> None:
         self.where = f"{name} ({port})"
         self._port, self._baud = port, baud
-        self._serial: serial.SerialBase | None = None
+        self._serial: serial.Serial | None = None
         self._reader: threading.Thread | None = None
         self._news = threading.Condition()
         self._out = threading.Lock()
@@ -66,9 +66,10 @@ class GrblLink:
     def open(self) -> None:
         """Open the port; nobody else can, until it is closed."""
         try:
-            self._serial = serial.serial_for_url(
+            opened = serial.serial_for_url(
                 self._port, baudrate=self._baud, timeout=None, write_timeout=1.0, exclusive=True
             )
+            self._serial = cast(serial.Serial, opened)
         except (serial.SerialException, OSError, ValueError) as error:
             raise DeviceAbsentError(
                 f"{self.where}: cannot open the port: {error}. Is it plugged in, and does no other program hold it?"
@@ -94,7 +95,7 @@ class GrblLink:
 
     # --- reading ---------------------------------------------------------------------------------------------
 
-    def _read(self, port: serial.SerialBase) -> None:
+    def _read(self, port: serial.Serial) -> None:
         rest = b""
         while self._serial is port:
             try:
@@ -140,7 +141,7 @@ class GrblLink:
 
     def _take_report(self, text: str) -> None:
         state, *pairs = text.split("|")
-        fields = dict(pair.partition(":")[::2] for pair in pairs)
+        fields = {name: value for name, _, value in (pair.partition(":") for pair in pairs)}
         try:
             if "WCO" in fields:
                 self._work_mm = float(fields["WCO"].split(",")[0])

@@ -1,20 +1,17 @@
-"""Writes the raw archive: what `sync` has returned survives a power cut."""
+"""Writes the raw archive of a scan: what `sync` has returned survives a power cut."""
 
 from __future__ import annotations
 
 import contextlib
-import os
 import time
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from mcap import records as mcap_records
-from mcap.data_stream import RecordBuilder
-
+from echolume_daemon.mcap_chunks import ChunkBuilder, ChunkFile
 from echolume_messages import archive_format, mcap_stream
 from echolume_messages.archive import ChunkReader
-from echolume_messages.bus.message import Message
+from echolume_messages.bus import Message
 from echolume_messages.errors import ArchiveError
 
 CHUNK_BYTES = 4 << 20
@@ -30,30 +27,13 @@ class Durable(NamedTuple):
     seq: int
 
 
-@dataclass(frozen=True)
-class Place:
-    """Where a written record lies."""
+class Place(NamedTuple):
+    """Where a written record lies: the byte at which its chunk starts."""
 
     stream: str
     boot: str
     seq: int
     chunk: int
-
-
-def _sync_directory(directory: Path) -> None:
-    handle = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
-def make_directory(directory: Path) -> None:
-    """Make a directory and those above it, each entry synced."""
-    missing = [d for d in (directory, *directory.parents) if not d.exists()]
-    for made in reversed(missing):
-        made.mkdir(exist_ok=True)
-        _sync_directory(made.parent)
 
 
 class ArchiveWriter:
@@ -62,9 +42,9 @@ class ArchiveWriter:
     Parameters
     ----------
     path
-        The file; it is created, or, with `resume`, gone on with after its last complete chunk.
+        The file; it is created, or, with `resume`, gone on with after its last whole chunk.
     resume
-        Go on with a file that a recorder left behind.
+        Go on with a file that a recorder left behind. What it holds is synced and returned by the next `sync`.
 
     Raises
     ------
@@ -79,32 +59,38 @@ class ArchiveWriter:
 
     def __init__(self, path: Path, resume: bool = False) -> None:
         self.path = path
-        self.unsynced_since_s: float | None = None
-        self.count = 0
-        self.bytes = 0
         self.records: dict[str, int] = {}
+        self.unsynced_since_s: float | None = None
+        """CLOCK_MONOTONIC of the oldest record that is not durable yet."""
+        self._file = ChunkFile(path)
+        self._chunk = ChunkBuilder()
         self._failure: ArchiveError | None = None
-        self._written: set[tuple[str, str, int]] = set()
-        self._places: list[Place] = []
+        self._known: set[tuple[str, str, int]] = set()
         self._pending: list[Durable] = []
-        self._clear_chunk()
-        self._chunk_indexes: list[mcap_records.ChunkIndex] = []
-        self._channel_counts: dict[int, int] = {}
-        self._first_ns = self._last_ns = 0
-        self._described = False
-        self._fd = -1
+        self._places: list[Place] = []
         try:
             if resume:
                 self._resume()
             else:
-                self._create()
+                self._file.create()
         except FileExistsError as error:
             raise ArchiveError(f"{path}: exists already; an archive is never written over") from error
         except OSError as error:
-            raise ArchiveError(f"{path}: cannot make the archive: {error.strerror}") from error
+            self._file.close()
+            raise ArchiveError(f"{path}: cannot open the archive: {error.strerror}") from error
+
+    @property
+    def bytes(self) -> int:
+        """Bytes in the file."""
+        return self._file.end
+
+    @property
+    def failure(self) -> ArchiveError | None:
+        """Why nothing is acknowledged any more, if so."""
+        return self._failure
 
     def write(self, message: Message) -> bool:
-        """Take a record; False if it is a double of one already taken.
+        """Take a record; False if it is a double of one taken before.
 
         Raises
         ------
@@ -114,24 +100,21 @@ class ArchiveWriter:
         self._check()
         header = message.header
         identity = (header.stream, header.boot, header.seq)
-        if identity in self._written:
+        if identity in self._known:
             return False
-        self._describe()
-        for number, data in archive_format.encode_message(message):
-            self._add(number, header.seq & 0xFFFFFFFF, header.t_wall_ns, header.t_ns, data)
-        self._written.add(identity)
-        self._places.append(Place(header.stream, header.boot, header.seq, self.bytes))
-        self._pending.append(Durable(header.stream, header.trigger, header.attempt, header.seq))
-        self.records[header.stream] = self.records.get(header.stream, 0) + 1
-        self.count += 1
+        if not self._file.described and not self._chunk.parts:
+            self._chunk.add_description()
+        for channel, data in archive_format.encode_message(message):
+            self._chunk.add_message(channel, header.seq & 0xFFFFFFFF, header.t_wall_ns, header.t_ns, data)
+        self._count(message, self._file.end)
         if self.unsynced_since_s is None:
             self.unsynced_since_s = time.monotonic()
-        if self._size >= CHUNK_BYTES:
+        if self._chunk.size >= CHUNK_BYTES:
             self._end_chunk()
         return True
 
     def sync(self) -> list[Durable]:
-        """Bring everything taken to the disk, and return what that made durable.
+        """Bring everything taken to the disk; returns what that made durable.
 
         Raises
         ------
@@ -142,18 +125,18 @@ class ArchiveWriter:
         if not self._pending:
             return []
         self._end_chunk()
-        self._guard(lambda: os.fdatasync(self._fd))
+        self._guard(self._file.sync)
         out, self._pending = self._pending, []
         self.unsynced_since_s = None
         return out
 
     def places(self) -> list[Place]:
-        """Where the records written since the last call lie; call it after `sync`."""
+        """Where the records synced since the last call lie."""
         out, self._places = self._places, []
         return out
 
     def close(self) -> list[Durable]:
-        """Write the index and close the file; returns what that made durable.
+        """Sync, write the index and close the file; returns what became durable.
 
         Raises
         ------
@@ -162,82 +145,51 @@ class ArchiveWriter:
         """
         try:
             out = self.sync()
-            self._guard(lambda: self._put(self._ending()))
-            self._guard(lambda: os.fsync(self._fd))
+            self._guard(self._file.finish)
         finally:
-            if self._fd >= 0:
-                os.close(self._fd)
-                self._fd = -1
+            self._file.close()
         return out
 
     def abandon(self) -> None:
-        """Close the file as it is."""
-        if self._fd >= 0:
-            os.close(self._fd)
-            self._fd = -1
+        """Close the file as it is, without an index."""
+        self._file.close()
 
-    def _check(self) -> None:
-        if self._failure is not None:
-            raise self._failure
-        if self._fd < 0:
-            raise ArchiveError(f"{self.path}: the archive is closed")
+    def _count(self, message: Message, chunk: int) -> None:
+        header = message.header
+        self._known.add((header.stream, header.boot, header.seq))
+        self._pending.append(Durable(header.stream, header.trigger, header.attempt, header.seq))
+        self._places.append(Place(header.stream, header.boot, header.seq, chunk))
+        self.records[header.stream] = self.records.get(header.stream, 0) + 1
 
-    def _guard(self, action: object) -> None:
-        assert callable(action)
-        try:
-            action()
-        except OSError as error:
-            with contextlib.suppress(OSError):
-                os.ftruncate(self._fd, self.bytes)
-            self._failure = ArchiveError(
-                f"{self.path}: {error.strerror}: the archive ends after {self.bytes} bytes; "
-                f"what was acknowledged is in it. Free space or check the disk, then scan again"
-            )
-            raise self._failure from error
-
-    def _create(self) -> None:
-        make_directory(self.path.parent)
-        self._fd = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o640)
-        builder = RecordBuilder()
-        mcap_records.Header(profile="", library="echolume").write(builder)
-        self._put(mcap_stream.MAGIC + builder.end())
-        os.fsync(self._fd)
-        _sync_directory(self.path.parent)
+    def _end_chunk(self) -> None:
+        chunk, self._chunk = self._chunk, ChunkBuilder()
+        if chunk.index:
+            self._guard(lambda: self._file.append(chunk))
 
     def _resume(self) -> None:
         scan = mcap_stream.Scan(self.path)
         reader = ChunkReader(self.path)
         with self.path.open("rb") as stream:
             for chunk in mcap_stream.chunks(stream, scan):
-                self._adopt(chunk, reader)
-        for index in self._chunk_indexes:
-            index.message_index_offsets = scan.indexes[index.chunk_start_offset]
-        self._fd = os.open(self.path, os.O_WRONLY | os.O_CLOEXEC)
-        os.ftruncate(self._fd, scan.end)
-        os.lseek(self._fd, scan.end, os.SEEK_SET)
-        os.fsync(self._fd)
-        self.bytes = scan.end
+                self._file.adopt(chunk)
+                for message in reader.records(chunk):
+                    self._count(message, chunk.start)
+        self._file.reopen(scan)
 
-    def _adopt(self, chunk: mcap_stream.Chunk, reader: ChunkReader) -> None:
-        """Count a chunk that is there already."""
-        self._chunk_indexes.append(
-            mcap_records.ChunkIndex(
-                chunk_length=chunk.end - chunk.start,
-                chunk_start_offset=chunk.start,
-                compression="",
-                compressed_size=len(chunk.data),
-                message_end_time=chunk.last_ns,
-                message_index_length=0,
-                message_index_offsets={},
-                message_start_time=chunk.first_ns,
-                uncompressed_size=len(chunk.data),
+    def _check(self) -> None:
+        if self._failure is not None:
+            raise self._failure
+        if not self._file.is_open:
+            raise ArchiveError(f"{self.path}: the archive is closed")
+
+    def _guard(self, action: Callable[[], None]) -> None:
+        try:
+            action()
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                self._file.cut()
+            self._failure = ArchiveError(
+                f"{self.path}: {error.strerror}; nothing is acknowledged any more, what was acknowledged is readable. "
+                "Free space or check the disk, then scan again"
             )
-        )
-        self._span(chunk.first_ns, chunk.last_ns)
-        for record in reader.records(chunk):
-            header = record.header
-            self._written.add((header.stream, header.boot, header.seq))
-            self._places.append(Place(header.stream, header.boot, header.seq, chunk.start))
-            self._pending.append(Durable(header.stream, header.trigger, header.attempt, header.seq))
-            self.records[header.stream] = self.records.get(header.stream, 0) + 1
-            self.count += 1
+            raise self._failure from error

@@ -90,13 +90,35 @@ class OpticalPipeline:
         self._per_guide_mm = float(self._normal @ np.asarray(laser.guide_direction, dtype=np.float64))
         self._sizes = (left.height_px, left.width_px), (right.height_px, right.width_px)
 
+    @staticmethod
+    def warm_up_kernels(left_shape: tuple[int, int] = (64, 96), right_shape: tuple[int, int] = (64, 96)) -> None:
+        """Compile or load the kernels on made-up cameras, so that the first stripe is not late."""
+        sizes = left_shape, right_shape
+        cameras = [
+            CameraCalibration(
+                width_px=size[1],
+                height_px=size[0],
+                camera_matrix=[[1000.0, 0.0, size[1] / 2], [0.0, 1000.0, size[0] / 2], [0.0, 0.0, 1.0]],
+                distortion=[0.0] * 5,
+                camera_from_rig=[
+                    [0.8, 0.0, -0.6 * side, 0.0],
+                    [0.0, -1.0, 0.0, 0.0],
+                    [-0.6 * side, 0.0, -0.8, 500.0],
+                    [0.0, 0.0, 0.0, 1.0],
+                ],
+                rms_px=0.0,
+            )
+            for size, side in zip(sizes, (-1.0, 1.0), strict=True)
+        ]
+        laser = LaserCalibration(normal=(1, 0, 0), offset_mm=0.0, guide_direction=(1, 0, 0), rms_mm=0.0)
+        frames = [np.full(size, 20, dtype=np.uint8) for size in sizes]
+        for frame in frames:
+            frame[:, frame.shape[1] // 2 - 2 : frame.shape[1] // 2 + 2] = 180
+        OpticalPipeline.of(cameras[0], cameras[1], laser).process(frames[0], frames[1], 0.0)
+
     def warm_up(self) -> None:
         """Compile or load the kernels, so that the first stripe is not late."""
-        for bright in (0, 200):
-            frames = [np.full(size, 20, dtype=np.uint8) for size in self._sizes]
-            for frame in frames:
-                frame[:, frame.shape[1] // 2 : frame.shape[1] // 2 + 4] += np.uint8(bright)
-            self.process(frames[0], frames[1], 0.0)
+        self.warm_up_kernels(*self._sizes)
 
     def process(self, left: Frame, right: Frame, x_mm: float) -> Structured:
         """Points of one stripe.

@@ -10,11 +10,11 @@ from echolume_messages.errors import ConfigError
 class Placer(Protocol):
     """What the operator needs of the emulated rig's control."""
 
-    def place_scene(self, name: str) -> None:
+    def place_scene(self, name: str, /) -> None:
         """Put a scene on the bench."""
         ...
 
-    def place_board(self, index: int) -> None:
+    def place_board(self, pose: int, /) -> None:
         """Put the calibration board on the bench, in one of its poses."""
         ...
 

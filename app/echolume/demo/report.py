@@ -73,7 +73,15 @@ def table(report: Report) -> str:
     points = ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in report["points"].items())
     lines.append(f"Points: {points}")
     if report.get("maps"):
-        columns = ["f1_at_0p5mm", "f1_at_1mm", "f1_at_2mm", "rmse_mm", "completeness", "glass_recall", "glass_precision"]
+        columns = [
+            "f1_at_0p5mm",
+            "f1_at_1mm",
+            "f1_at_2mm",
+            "rmse_mm",
+            "completeness",
+            "glass_recall",
+            "glass_precision",
+        ]
         lines.append("")
         lines += _table(["map", *columns], [[n, *(r.get(c) for c in columns)] for n, r in report["maps"].items()])
     lines.append("")

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import os
-import socket
+import json
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Generator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 
 from echolume.demo.operator import Operator
 from echolume.demo.plans import plan_text
 from echolume.demo.report import Report
-from echolume.demo.truth import score_maps
-from echolume.processes import ProcessTree
+from echolume.demo.results import Passes, archive_row, ledger_rows, score_maps
+from echolume.processes import ProcessEndedError, ProcessTree
 from echolume.progress import Progress
 from echolume_daemon.client import ScanClient
 from echolume_drivers.emulated.control import Control
@@ -25,13 +25,15 @@ from echolume_messages import calibration as calibration_file
 from echolume_messages import plan as plans
 from echolume_messages import rig as rig_file
 from echolume_messages import topics
-from echolume_messages.archive import summary
-from echolume_messages.bus import Bus, Subscription, connect
+from echolume_messages.bus import Bus, connect
+from echolume_messages.calibration import Calibration
 from echolume_messages.errors import IncompleteScanError
-from echolume_messages.rig_text import rig_toml
+from echolume_messages.rig import Rig
 
-START_TIMEOUT_S = 60.0
-MAP_TIMEOUT_S = 180.0
+START_TIMEOUT_S = 90.0
+MAP_TIMEOUT_S = 240.0
+
+Json = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -46,32 +48,19 @@ class DemoSettings:
     plan: Path | None = None
 
 
-@dataclass
-class Timing:
-    """When things happened, seconds on the monotonic clock."""
+@dataclass(frozen=True)
+class RunningRig:
+    """The emulated rig and its services, up and connected."""
 
-    started_s: float = field(default_factory=time.monotonic)
-    passes_s: dict[str, float] = field(default_factory=dict[str, float])
-    _at: tuple[str, float] = ("", 0.0)
-
-    def follow(self, kind: str) -> None:
-        """Charge the time since the last call to the kind of pass that was running."""
-        now_s = time.monotonic()
-        last, since_s = self._at
-        if last:
-            self.passes_s[last] = self.passes_s.get(last, 0.0) + now_s - since_s
-        self._at = (kind, now_s)
-
-
-def free_port() -> int:
-    """A TCP port on 127.0.0.1 that was free a moment ago."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    rig: Rig
+    rig_path: Path
+    control: Control
+    bus: Bus
+    tree: ProcessTree
 
 
 def run_demo(settings: DemoSettings, progress: Progress) -> Report:
-    """Scan the emulated rig into a hybrid map.
+    """Calibrate the emulated rig, scan its scene, and score the hybrid map.
 
     Raises
     ------
@@ -80,15 +69,117 @@ def run_demo(settings: DemoSettings, progress: Progress) -> Report:
     """
     out = settings.out.resolve()
     out.mkdir(parents=True, exist_ok=True)
-    plan = plans.load(settings.plan) if settings.plan else plans.parse(plan_text("demo"), "demo.toml")
-    plan_toml = settings.plan.read_text(encoding="utf-8") if settings.plan else plan_text("demo")
-    with ProcessTree(out / "logs") as tree:
-        progress.say("starting the emulated rig and its services")
-        rig, rig_path, control = _start_rig(settings, out, tree)
-        with connect(rig.bus.endpoint, rig.name, timeout_s=START_TIMEOUT_S) as bus:
-            _start_services(rig_path, out, bus, tree)
-            timing = Timing()
-            calibration = _calibrate(rig, out, bus, control, tree, progress)
-            control.place_scene(settings.scene)
-            _scan(plan_toml, calibration, rig, out, bus, tree, progress, timing)
-            raise NotImplementedError
+    text = settings.plan.read_text(encoding="utf-8") if settings.plan else plan_text("demo")
+    plan = plans.parse(text, str(settings.plan or "demo.toml"))
+    progress.say("starting the emulated rig, the rig's services and the lab's subscribers")
+    with ProcessTree(out / "logs") as tree, running_rig(settings, out, tree) as rig:
+        started_s = time.monotonic()
+        calibration, calibration_report = _calibrate(rig, out, progress)
+        rig.control.place_scene(settings.scene)
+        passes = Passes()
+        ledger, done = _scan(rig, text, calibration, out, progress, passes)
+        truth = out / "truth.npz"
+        rig.control.truth(truth)
+        total_s = time.monotonic() - started_s
+        progress.say("scoring the maps against the truth")
+        report: Report = {
+            "version": version("echolume"),
+            "scan": ledger["scan"],
+            "seed": settings.seed,
+            "calibration": {"digest": calibration.digest, **calibration_report},
+            "ledger": ledger_rows(ledger),
+            "archive": archive_row(out / "raw.mcap", ledger),
+            "points": done["points"],
+            "maps": score_maps(out / "map.npz", truth, plan.map),
+            "timing": {
+                "total_s": total_s,
+                "optical_pass_s": passes.seconds["optical"],
+                "ultrasonic_pass_s": passes.seconds["ultrasonic"],
+                "processing_lag_p99_ms": done["lag_p99_ms"],
+            },
+            "resources": {"peak_pss_mib": tree.peak_pss_mib},
+            "digest": {"hybrid": done["digest"]},
+            "notes": done.get("notes", []),
+        }
+    (out / "report.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    return report
+
+
+@contextmanager
+def running_rig(settings: DemoSettings, out: Path, tree: ProcessTree) -> Generator[RunningRig]:
+    """The emulated rig, its services and the subscribers, each in a process of its own."""
+    folder = out / "rig"
+    rig_path = folder / "rig.toml"
+    rig_path.unlink(missing_ok=True)
+    emulate = ["--seed", str(settings.seed), "--speed", str(settings.speed), "--pulse", settings.pulse]
+    tree.start("emulated-rig", ["emulate", "--out", str(folder), *emulate])
+    tree.wait_until(rig_path.exists, "the emulated rig", START_TIMEOUT_S)
+    rig = rig_file.load(rig_path)
+    for name in topics.SERVICES:
+        tree.start(name, ["serve", name, "--rig", str(rig_path)])
+    for name in topics.SUBSCRIBERS:
+        tree.start(name, ["process", name, "--rig", str(rig_path), "--out", str(out)])
+    wanted = {*topics.SERVICES[1:], *topics.SUBSCRIBERS}
+    with (
+        connect(rig.bus.endpoint, rig.name, timeout_s=START_TIMEOUT_S) as bus,
+        Control.beside(rig_path) as control,
+    ):
+        tree.wait_until(lambda: wanted <= bus.alive(), f"services {', '.join(sorted(wanted))}", START_TIMEOUT_S)
+        yield RunningRig(rig, rig_path, control, bus, tree)
+
+
+def _follow(rig: RunningRig, progress: Progress, passes: Passes | None, state: Json) -> None:
+    rig.tree.check()
+    if passes is not None:
+        passes.follow(str(state.get("kind", "")))
+    if state.get("state") == "running":
+        progress.count(str(state.get("pass", "")), int(state.get("matched", 0)), int(state.get("planned", 0)))
+
+
+def _run_plan(
+    rig: RunningRig,
+    text: str,
+    archive: Path,
+    calibration: Calibration | None,
+    progress: Progress,
+    passes: Passes | None = None,
+) -> Json:
+    """Run a plan to its final ledger, with the demo's operator at hand."""
+    archive.unlink(missing_ok=True)
+    client = ScanClient(rig.bus, "demo")
+    operator = Operator(rig.control)
+    as_json = None if calibration is None else cast("Json", msgspec.to_builtins(calibration))
+    client.start(text, archive=str(archive), calibration=as_json)
+    ledger = cast("Json", client.wait(lambda state: _follow(rig, progress, passes, state), operator.answer))
+    if ledger["outcome"] != "complete":
+        missing = {name: row["missing_triggers"] for name, row in ledger["passes"].items() if row["missing"]}
+        raise IncompleteScanError(f"scan {ledger['scan']}: {ledger['outcome']}; missing triggers: {missing or 'none'}")
+    return ledger
+
+
+def _calibrate(rig: RunningRig, out: Path, progress: Progress) -> tuple[Calibration, Json]:
+    progress.say("calibrating: boards, stripes on boards, tilted poses over the plate, the block")
+    archive = out / "calibration.mcap"
+    _run_plan(rig, plan_text("calibrate"), archive, None, progress)
+    from echolume_processing.calibrate_rig import calibrate_rig
+
+    progress.say("working out the calibration")
+    calibration, figures = calibrate_rig(archive, rig.rig.name, rig.rig.array)
+    calibration_file.save(calibration, out / "calibration.json")
+    return calibration, figures
+
+
+def _scan(
+    rig: RunningRig, text: str, calibration: Calibration, out: Path, progress: Progress, passes: Passes
+) -> tuple[Json, Json]:
+    progress.say("scanning: light, then sound")
+    with rig.bus.subscribe([topics.HYBRID_DONE], depth=8) as done:
+        ledger = _run_plan(rig, text, out / "raw.mcap", calibration, progress, passes)
+        progress.say("fusing light and sound")
+        deadline_s = time.monotonic() + MAP_TIMEOUT_S
+        while time.monotonic() < deadline_s:
+            rig.tree.check()
+            message = done.get(0.5)
+            if message is not None and (found := cast("Json", message.json()))["scan"] == ledger["scan"]:
+                return ledger, found
+    raise ProcessEndedError(f"hybrid: no map after {MAP_TIMEOUT_S:.0f} s; see {out / 'logs' / 'hybrid.log'}")

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from echolume_messages.plan import MapField
-from echolume_messages.types import Structured
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from echolume_messages.plan import MapField
+from echolume_messages.types import Structured
 from echolume_processing.hybrid.grid import STEPS_PER_MM, accumulate, cell_index
 from echolume_processing.hybrid.model import cell_centres_mm
 

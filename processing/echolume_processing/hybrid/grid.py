@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+
 from echolume_messages.plan import MapField
 from echolume_messages.types import OpticalSource, Provenance, Structured
-from numpy.typing import NDArray
 
 STEPS_PER_MM = 1000.0
 """Heights are compared as whole micrometres, so that equal evidence gives equal bits."""

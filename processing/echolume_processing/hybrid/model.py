@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+
 from echolume_messages.plan import MapField
 from echolume_messages.types import MAP_CELL, Label, Provenance, Structured
-from numpy.typing import NDArray
 
 
 @dataclass(frozen=True)

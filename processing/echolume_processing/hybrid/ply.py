@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from echolume_messages.types import Label
 
+from echolume_messages.types import Label
 from echolume_processing.hybrid.digest import digest
 from echolume_processing.hybrid.model import HybridMap, cell_centres_mm
 

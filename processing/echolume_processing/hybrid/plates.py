@@ -1,0 +1,117 @@
+"""Seeds for plates: which height each ping would give to a plate below it, and the plane through those heights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from echolume_messages.plan import MapField
+from echolume_processing.hybrid.model import cell_centres_mm
+from echolume_processing.hybrid.predict import Aperture
+from echolume_processing.hybrid.sounding import CEILING_MM, Sounding
+
+HEIGHT_STEP_MM = 0.25
+LOWEST_MM = -5.0
+FIT_ROUNDS = 20
+STEEPEST = 0.4
+"""No plate is sought beyond this slope: its echo would miss the array everywhere."""
+
+
+@dataclass(frozen=True)
+class Plane:
+    """z = z_mm + slope_x (x - x_mm) + slope_y (y - y_mm)."""
+
+    x_mm: float
+    y_mm: float
+    z_mm: float
+    slope_x: float = 0.0
+    slope_y: float = 0.0
+
+    def at(self, x_mm: NDArray[np.float64], y_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Height at points."""
+        return self.z_mm + self.slope_x * (x_mm - self.x_mm) + self.slope_y * (y_mm - self.y_mm)
+
+    def image(self, field: MapField) -> NDArray[np.float64]:
+        """Height at each cell of a field."""
+        return self.at(*np.meshgrid(*cell_centres_mm(field)))
+
+    def raised(self, dz_mm: float) -> Plane:
+        """The parallel plane, higher by `dz_mm`."""
+        return Plane(self.x_mm, self.y_mm, self.z_mm + dz_mm, self.slope_x, self.slope_y)
+
+
+@dataclass(frozen=True)
+class PingHeights:
+    """Height of the horizontal plate that explains each ping best, and how well (correlation); both (pings,)."""
+
+    which: NDArray[np.int64]
+    height_mm: NDArray[np.float64]
+    likeness: NDArray[np.float64]
+
+
+def ping_heights(found: Sounding, which: NDArray[np.int64]) -> PingHeights:
+    """Correlate pings with the image-source echo of a horizontal plate at every height.
+
+    Notes
+    -----
+    A narrow-band pulse gives almost the same likeness every half wavelength; the plane through many pings has
+    the same ambiguity, and only the whole waveform model can judge it.
+    """
+    heights_mm = np.arange(LOWEST_MM, CEILING_MM, HEIGHT_STEP_MM)
+    measured = found.gate.spectrum(found.measured[which])
+    best_mm, like = np.empty(which.size), np.empty(which.size)
+    for n, k in enumerate(which):
+        plates = _plate_spectra(found, found.apertures[int(k)], heights_mm)
+        match = np.tensordot(plates.conj(), measured[n], axes=([1, 2], [0, 1])).real
+        match /= np.sqrt((np.abs(plates) ** 2).sum(axis=(1, 2)) * (np.abs(measured[n]) ** 2).sum())
+        top = int(match.argmax())
+        best_mm[n], like[n] = heights_mm[top], match[top]
+    return PingHeights(which, best_mm, like)
+
+
+def _plate_spectra(found: Sounding, where: Aperture, heights_mm: NDArray[np.float64]) -> NDArray[np.complex64]:
+    """Spectra (heights, receivers, bins) of endless horizontal plates, by the image of the emitter."""
+    emitter, receivers = where.elements_mm[0], where.elements_mm[1:]
+    image = np.repeat(emitter[None, :], heights_mm.size, axis=0)
+    image[:, 2] = 2 * heights_mm - emitter[2]
+    ray = receivers[None, :, :] - image[:, None, :]
+    path_mm = np.linalg.norm(ray, axis=2)  # (heights, receivers)
+    wave = 2 * np.pi * found.band.frequency_hz / (found.speed_mps * 1e3)
+    spectra = np.exp(-1j * path_mm[..., None] * wave).astype(np.complex64) / path_mm[..., None].astype(np.float32)
+    return spectra * (found.channels.response * found.channels.filter)
+
+
+def fit_plane(found: Sounding, heights: PingHeights, tilted: bool) -> Plane:
+    """Plane through the heights of some pings, least absolute deviations weighted by likeness.
+
+    Notes
+    -----
+    A ping's height is its perpendicular distance to the plate taken off the array's height, so it is turned
+    back with the slope found. Fewer than four pings, or pings in a row, give a horizontal plane.
+    """
+    centre = np.array([found.apertures[int(k)].elements_mm[0] for k in heights.which])
+    middle = centre[:, :2].mean(axis=0)
+    offset = centre[:, :2] - middle
+    level = float(_weighted_median(heights.height_mm, heights.likeness))
+    slope = np.zeros(2)
+    spread = np.linalg.svd(offset, compute_uv=False) if tilted and len(offset) >= 4 else np.zeros(2)
+    if tilted and spread[-1] > 5.0:
+        columns = np.column_stack((np.ones(len(offset)), offset))
+        distance = centre[:, 2] - heights.height_mm
+        solution = np.array([level, 0.0, 0.0])
+        for _ in range(FIT_ROUNDS):
+            target = centre[:, 2] - distance * np.sqrt(1 + solution[1] ** 2 + solution[2] ** 2)
+            weight = heights.likeness.clip(0.05) / (np.abs(target - columns @ solution) + 0.3)
+            normal = columns.T @ (weight[:, None] * columns)
+            solution = np.linalg.solve(normal, columns.T @ (weight * target))
+            solution[1:] = solution[1:].clip(-STEEPEST, STEEPEST)
+        level, slope = float(solution[0]), solution[1:]
+    return Plane(float(middle[0]), float(middle[1]), level, float(slope[0]), float(slope[1]))
+
+
+def _weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> np.float64:
+    order = np.argsort(values, kind="stable")
+    share = np.cumsum(weights[order].clip(1e-3))
+    return values[order[int(np.searchsorted(share, 0.5 * share[-1]))]]

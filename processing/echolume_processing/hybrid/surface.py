@@ -1,0 +1,114 @@
+"""A heightfield prepared for sound: facets with slopes, horizons for shadow, walls for the double bounce."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from echolume_messages.plan import MapField
+
+AZIMUTHS = 32
+"""Directions in which the horizon of a facet is known."""
+HORIZON_MM = 60.0
+WALL_MM = 2.0
+"""A rise of more than this between two neighbouring cells is a wall, not a slope."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What the predictor needs of a heightfield; images have the shape of the field."""
+
+    field: MapField
+    height_mm: NDArray[np.float64]
+    slope: NDArray[np.float32]
+    """dz/dx and dz/dy of each facet, shape (rows, columns, 2)."""
+    horizon: NDArray[np.float32]
+    """Tangent of the elevation under which the surroundings rise, shape (rows, columns, AZIMUTHS)."""
+    walls: NDArray[np.float64]
+    """Upright faces (n, 6): x, y of the face's middle, its lower and upper z, and its outward normal nx, ny."""
+
+
+def surface(height_mm: NDArray[np.float64], field: MapField) -> Surface:
+    """Prepare a heightfield without holes.
+
+    Raises
+    ------
+    ValueError
+        If a height is missing: a predictor needs a closed surface.
+    """
+    if height_mm.shape != field.shape or not np.isfinite(height_mm).all():
+        raise ValueError(f"height_mm: expected finite heights of shape {field.shape}, got {height_mm.shape}")
+    height_mm = np.ascontiguousarray(height_mm, dtype=np.float64)
+    reach = round(HORIZON_MM / field.cell_mm)
+    return Surface(
+        field,
+        height_mm,
+        slopes(height_mm, field.cell_mm),
+        _horizons(height_mm, _highest_around(height_mm, reach), field.cell_mm, reach),
+        _walls(height_mm, field),
+    )
+
+
+def slopes(height_mm: NDArray[np.float64], cell_mm: float) -> NDArray[np.float32]:
+    """Slope of each cell from those neighbours that no wall separates from it."""
+    padded = np.pad(height_mm, 1, mode="edge")
+    out = np.zeros((*height_mm.shape, 2), dtype=np.float32)
+    for axis, (low, high) in enumerate(((padded[1:-1, :-2], padded[1:-1, 2:]), (padded[:-2, 1:-1], padded[2:, 1:-1]))):
+        back, forth = height_mm - low, high - height_mm
+        use_back, use_forth = np.abs(back) <= WALL_MM, np.abs(forth) <= WALL_MM
+        total = np.where(use_back, back, 0.0) + np.where(use_forth, forth, 0.0)
+        out[..., axis] = total / np.maximum(1, use_back.astype(int) + use_forth.astype(int)) / cell_mm
+    return out
+
+
+def _highest_around(height_mm: NDArray[np.float64], reach: int) -> NDArray[np.float64]:
+    """Greatest height within `reach` cells of each cell."""
+    return np.asarray(ndimage.maximum_filter(height_mm, size=2 * reach + 1, mode="nearest"))
+
+
+@numba.njit(cache=True)
+def _horizons(
+    height_mm: NDArray[np.float64], highest_mm: NDArray[np.float64], cell_mm: float, reach: int
+) -> NDArray[np.float32]:
+    rows, columns = height_mm.shape
+    out = np.zeros((rows, columns, AZIMUTHS), dtype=np.float32)
+    for a in range(AZIMUTHS):
+        angle = 2 * np.pi * a / AZIMUTHS
+        dx, dy = np.cos(angle), np.sin(angle)
+        for j in range(rows):
+            for i in range(columns):
+                z, top = height_mm[j, i], highest_mm[j, i]
+                best = 0.0
+                if top - z > WALL_MM:
+                    for s in range(1, reach + 1):
+                        ii, jj = int(round(i + s * dx)), int(round(j + s * dy))
+                        if ii < 0 or jj < 0 or ii >= columns or jj >= rows:
+                            break
+                        rise = height_mm[jj, ii] - z
+                        if rise > WALL_MM and rise > best * s * cell_mm:
+                            best = rise / ((s - 0.5) * cell_mm)
+                        if best * s * cell_mm > top - z:
+                            break
+                out[j, i, a] = best
+    return out
+
+
+def _walls(height_mm: NDArray[np.float64], field: MapField) -> NDArray[np.float64]:
+    """Faces between neighbouring cells whose heights differ by more than `WALL_MM`."""
+    x_mm = field.x_mm[0] + np.arange(height_mm.shape[1] + 1) * field.cell_mm
+    y_mm = field.y_mm[0] + np.arange(height_mm.shape[0] + 1) * field.cell_mm
+    found: list[NDArray[np.float64]] = []
+    half = 0.5 * field.cell_mm
+    rise = np.diff(height_mm, axis=1)
+    j, i = np.nonzero(np.abs(rise) > WALL_MM)
+    low, high = np.minimum(height_mm[j, i], height_mm[j, i + 1]), np.maximum(height_mm[j, i], height_mm[j, i + 1])
+    found.append(np.column_stack((x_mm[i + 1], y_mm[j] + half, low, high, -np.sign(rise[j, i]), 0.0 * low)))
+    rise = np.diff(height_mm, axis=0)
+    j, i = np.nonzero(np.abs(rise) > WALL_MM)
+    low, high = np.minimum(height_mm[j, i], height_mm[j + 1, i]), np.maximum(height_mm[j, i], height_mm[j + 1, i])
+    found.append(np.column_stack((x_mm[i] + half, y_mm[j + 1], low, high, 0.0 * low, -np.sign(rise[j, i]))))
+    return np.ascontiguousarray(np.concatenate(found))

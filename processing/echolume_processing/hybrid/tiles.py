@@ -1,0 +1,230 @@
+"""Which tiles of the ground a plate covers: box-constrained least squares on the echoes that the base leaves over."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from echolume_processing.hybrid.kernels import ANGLES
+from echolume_processing.hybrid.plates import Plane
+from echolume_processing.hybrid.predict import directivity
+from echolume_processing.hybrid.sounding import Sounding, Spectra
+from echolume_processing.hybrid.surface import Surface
+
+TILE_CELLS = 5
+NEAR_MM = 50.0
+"""Pings further than this from a tile's middle do not judge it."""
+SMOOTHING = 0.03
+SWEEPS = 200
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """Square tiles of a window of a field; corners are cell indices of their first cell, shape (n, 2) as (j, i)."""
+
+    corners: NDArray[np.int64]
+    grid: NDArray[np.int64]
+    """Number of each tile in the window's raster of tiles, -1 where there is none."""
+    origin: tuple[int, int]
+
+
+def tiles_over(mask: Mask) -> Tiles:
+    """Tiles that cover a mask."""
+    j, i = np.nonzero(mask)
+    j0, i0 = int(j.min()), int(i.min())
+    rows, columns = (int(j.max()) - j0) // TILE_CELLS + 1, (int(i.max()) - i0) // TILE_CELLS + 1
+    padded = np.zeros((rows * TILE_CELLS, columns * TILE_CELLS), dtype=np.bool_)
+    part = mask[j0 : j0 + padded.shape[0], i0 : i0 + padded.shape[1]]
+    padded[: part.shape[0], : part.shape[1]] = part
+    used = padded.reshape(rows, TILE_CELLS, columns, TILE_CELLS).any(axis=(1, 3))
+    grid = np.full((rows, columns), -1, dtype=np.int64)
+    grid[used] = np.arange(int(used.sum()))
+    tj, ti = np.nonzero(used)
+    return Tiles(np.column_stack((j0 + tj * TILE_CELLS, i0 + ti * TILE_CELLS)), grid, (j0, i0))
+
+
+def occupancy(
+    found: Sounding, base: Surface, predicted: Spectra, which: NDArray[np.int64], plane: Plane, tiles: Tiles
+) -> NDArray[np.float64]:
+    """How much of each tile the plate covers, 0 to 1, shape (tiles,).
+
+    Parameters
+    ----------
+    predicted
+        Echoes of the base alone for the pings `which`.
+    plane
+        Where the plate lies.
+
+    Notes
+    -----
+    Linear in the occupancies: a covered tile adds the plate's echo and takes the base's away. The plate's shadow
+    on its surroundings is left out here; the final judgement predicts it.
+    """
+    band = found.band
+    every = max(1, found.gate.samples // (found.gate.last - found.gate.first))
+    left_over = found.gate.spectrum(found.measured[which] - found.gate.waveform(predicted))[..., ::every]
+    table = directivity(found.predictor.radius_mm, band.nodes_hz, found.speed_mps)
+    wave = 2 * np.pi * band.frequency_hz[::every] / (found.speed_mps * 1e3)
+    response = (found.channels.response * found.channels.filter)[:, ::every]
+    weights = np.ascontiguousarray(band.weights[:, ::every], dtype=np.float32)
+    field = base.field
+    middle = np.column_stack(
+        (
+            field.x_mm[0] + (tiles.corners[:, 1] + TILE_CELLS / 2) * field.cell_mm,
+            field.y_mm[0] + (tiles.corners[:, 0] + TILE_CELLS / 2) * field.cell_mm,
+        )
+    )
+    foot_mm = found.foot_mm
+    count = tiles.corners.shape[0]
+    gram, right = np.zeros((count, count)), np.zeros(count)
+    plate_mm = plane.image(field)
+    for n, k in enumerate(which):
+        near = np.nonzero(np.linalg.norm(middle - foot_mm[k], axis=1) < NEAR_MM)[0]
+        if not near.size:
+            continue
+        where = found.apertures[int(k)]
+        effect = _tile_spectra(
+            tiles.corners[near], base.height_mm, base.slope, plate_mm, plane.slope_x, plane.slope_y,
+            field.x_mm[0], field.y_mm[0], field.cell_mm, where.elements_mm, where.axis, table, weights, wave,
+        )  # fmt: skip
+        effect = (effect * (1j * wave * response).astype(np.complex64)).reshape(near.size, -1)
+        real = np.concatenate((effect.real, effect.imag), axis=1)
+        target = left_over[n].reshape(-1)
+        gram[np.ix_(near, near)] += real @ real.T
+        right[near] += real @ np.concatenate((target.real, target.imag))
+    pull = SMOOTHING * float(np.trace(gram)) / count
+    return _solve_box(gram + pull * _roughness(tiles.grid, count), right, SWEEPS)
+
+
+def covered(share: NDArray[np.float64], tiles: Tiles, shape: tuple[int, int]) -> Mask:
+    """Cells that the plate covers: occupancies interpolated between tile middles, cut at one half, holes closed."""
+    coarse = np.where(tiles.grid >= 0, share[tiles.grid], 0.0)
+    padded = np.pad(coarse, 1)
+    rows, columns = coarse.shape
+    at_j = (np.arange(rows * TILE_CELLS) + 0.5) / TILE_CELLS + 0.5
+    at_i = (np.arange(columns * TILE_CELLS) + 0.5) / TILE_CELLS + 0.5
+    fine = ndimage.map_coordinates(padded, np.meshgrid(at_j, at_i, indexing="ij"), order=1) > 0.5
+    out = np.zeros(shape, dtype=np.bool_)
+    j0, i0 = tiles.origin
+    target = out[j0 : j0 + fine.shape[0], i0 : i0 + fine.shape[1]]
+    target |= ndimage.binary_fill_holes(fine)[: target.shape[0], : target.shape[1]]
+    return out
+
+
+def _roughness(grid: NDArray[np.int64], count: int) -> NDArray[np.float64]:
+    """Matrix of the sum of squared differences between neighbouring tiles."""
+    out = np.zeros((count, count))
+    for a, b in ((grid[:, :-1], grid[:, 1:]), (grid[:-1], grid[1:])):
+        both = (a >= 0) & (b >= 0)
+        p, q = a[both], b[both]
+        np.add.at(out, (p, p), 1.0)
+        np.add.at(out, (q, q), 1.0)
+        np.add.at(out, (p, q), -1.0)
+        np.add.at(out, (q, p), -1.0)
+    return out
+
+
+@numba.njit(cache=True)
+def _solve_box(gram: NDArray[np.float64], right: NDArray[np.float64], sweeps: int) -> NDArray[np.float64]:
+    """Minimise x'Gx/2 - b'x over 0 <= x <= 1 by projected Gauss-Seidel."""
+    n = right.size
+    x = np.zeros(n)
+    for _ in range(sweeps):
+        for t in range(n):
+            if gram[t, t] <= 0:
+                continue
+            step = (right[t] - np.dot(gram[t], x)) / gram[t, t]
+            x[t] = min(1.0, max(0.0, x[t] + step))
+    return x
+
+
+@numba.njit(cache=True, fastmath=True)
+def _tile_spectra(
+    corners: NDArray[np.int64],
+    height_mm: NDArray[np.float64],
+    slope: NDArray[np.float32],
+    plate_mm: NDArray[np.float64],
+    plate_gx: float,
+    plate_gy: float,
+    x0_mm: float,
+    y0_mm: float,
+    cell_mm: float,
+    elements_mm: NDArray[np.float64],
+    axis: NDArray[np.float64],
+    table: NDArray[np.float32],
+    weights: NDArray[np.float32],
+    wave: NDArray[np.float64],
+) -> NDArray[np.complex64]:
+    """Plate minus base for each tile, per receiver and bin, without the factor jk."""
+    receivers, bins = elements_mm.shape[0] - 1, wave.size
+    out = np.zeros((corners.shape[0], receivers, bins), dtype=np.complex64)
+    first, step = wave[0], wave[1] - wave[0]
+    area = cell_mm * cell_mm / (4 * np.pi)
+    lobes = np.empty((receivers, bins), dtype=np.float32)
+    for t in range(corners.shape[0]):
+        for layer in range(2):
+            _lobes(
+                lobes, corners[t], plate_mm if layer == 0 else height_mm, x0_mm, y0_mm, cell_mm, elements_mm, axis,
+                table, weights,
+            )  # fmt: skip
+            for jj in range(TILE_CELLS):
+                for ii in range(TILE_CELLS):
+                    j, i = corners[t, 0] + jj, corners[t, 1] + ii
+                    if j >= height_mm.shape[0] or i >= height_mm.shape[1]:
+                        continue
+                    x, y = x0_mm + (i + 0.5) * cell_mm, y0_mm + (j + 0.5) * cell_mm
+                    z, gx, gy, sign = plate_mm[j, i], plate_gx, plate_gy, 1.0
+                    if layer == 1:
+                        z, gx, gy, sign = height_mm[j, i], slope[j, i, 0], slope[j, i, 1], -1.0
+                    ex, ey, ez = elements_mm[0, 0] - x, elements_mm[0, 1] - y, elements_mm[0, 2] - z
+                    r1 = np.sqrt(ex * ex + ey * ey + ez * ez)
+                    lit1 = max(0.0, (ez - gx * ex - gy * ey) / r1)
+                    for c in range(receivers):
+                        rx, ry, rz = elements_mm[c + 1, 0] - x, elements_mm[c + 1, 1] - y, elements_mm[c + 1, 2] - z
+                        r2 = np.sqrt(rx * rx + ry * ry + rz * rz)
+                        lit2 = max(0.0, (rz - gx * rx - gy * ry) / r2)
+                        path = r1 + r2
+                        phasor = np.complex64(sign * area * (lit1 + lit2) / (r1 * r2) * np.exp(-1j * first * path))
+                        turn = np.complex64(np.exp(-1j * step * path))
+                        for f in range(bins):
+                            out[t, c, f] += lobes[c, f] * phasor
+                            phasor *= turn
+    return out
+
+
+@numba.njit(cache=True, fastmath=True)
+def _lobes(
+    out: NDArray[np.float32],
+    corner: NDArray[np.int64],
+    height_mm: NDArray[np.float64],
+    x0_mm: float,
+    y0_mm: float,
+    cell_mm: float,
+    elements_mm: NDArray[np.float64],
+    axis: NDArray[np.float64],
+    table: NDArray[np.float32],
+    weights: NDArray[np.float32],
+) -> None:
+    """Directivity both ways at the middle of a tile, per receiver and bin."""
+    j = min(corner[0] + TILE_CELLS // 2, height_mm.shape[0] - 1)
+    i = min(corner[1] + TILE_CELLS // 2, height_mm.shape[1] - 1)
+    x, y, z = x0_mm + (i + 0.5) * cell_mm, y0_mm + (j + 0.5) * cell_mm, height_mm[j, i]
+    emitted = table[0]
+    for c in range(elements_mm.shape[0]):
+        vx, vy, vz = elements_mm[c, 0] - x, elements_mm[c, 1] - y, elements_mm[c, 2] - z
+        cosine = -(vx * axis[0] + vy * axis[1] + vz * axis[2]) / np.sqrt(vx * vx + vy * vy + vz * vz)
+        lobe = table[int((1 - min(1.0, max(0.0, cosine)) ** 2) * (ANGLES - 1))]
+        if c == 0:
+            emitted = lobe
+            continue
+        for f in range(weights.shape[1]):
+            total = np.float32(0)
+            for m in range(weights.shape[0]):
+                total += weights[m, f] * emitted[m] * lobe[m]
+            out[c - 1, f] = total

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +10,6 @@ from echolume_messages.calibration import ArrayCalibration
 from echolume_messages.errors import CalibrationRejectedError
 from echolume_messages.geometry import Matrix, Points3, require_shape, rotation_from_vector, transform
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
 from echolume_processing.ping import Ping
@@ -22,11 +21,15 @@ from echolume_processing.ultrasonic.pipeline import (
 )
 from echolume_processing.ultrasonic.predictor import BlockPredictor
 
-FACET_MM = 1.0
+FACET_MM = 2.0
 RAISED_MM = 3.0
 """Optical points lower than this are the plate."""
 PRIOR_MM = 3.0
 PRIOR_RAD = float(np.radians(3.0))
+STEP = 0.03
+"""Of the prior sigma, for differences."""
+CLOSE = 2e-3
+MAX_ITERATIONS = 8
 LIMIT_MM = 0.5
 LIMIT_RAD = float(np.radians(0.5))
 NAMES = ("rig_from_robot x", "rig_from_robot y", "rig_from_robot yaw")
@@ -42,13 +45,19 @@ class BlockFit:
     """Share of the block's echo energy that the fitted block explains."""
 
 
-def raised_facets(points_mm: Points3, facet_mm: float = FACET_MM) -> Points3:
-    """Centres of horizontal facets wherever the nearest optical point is raised above the plate, (facets, 3).
+def raised_facets(points_mm: Points3, facet_mm: float = FACET_MM) -> tuple[Points3, NDArray[np.float64]]:
+    """Horizontal facets wherever the nearest optical points are raised above the plate.
 
     Parameters
     ----------
     points_mm : (n, 3) float64
         Optical points of the block and some plate around it, rig frame.
+
+    Returns
+    -------
+    centres_mm : (facets, 3) float64
+    area_mm2 : (facets,) float64
+        Facets at the block's edges are smaller than those inside.
     """
     require_shape("points_mm", points_mm, (None, 3))
     raised = points_mm[points_mm[:, 2] > RAISED_MM]
@@ -57,16 +66,21 @@ def raised_facets(points_mm: Points3, facet_mm: float = FACET_MM) -> Points3:
             f"array calibration: light sees no block on the plate ({len(raised)} points above {RAISED_MM} mm); put the "
             "block on the bench for the passes 'block-light' and 'block-sound'"
         )
-    low, high = raised[:, :2].min(axis=0) - 3 * facet_mm, raised[:, :2].max(axis=0) + 3 * facet_mm
-    x = np.arange(low[0], high[0], facet_mm)
-    y = np.arange(low[1], high[1], facet_mm)
+    fine_mm = facet_mm / 8
+    low, high = raised[:, :2].min(axis=0) - 2 * facet_mm, raised[:, :2].max(axis=0) + 2 * facet_mm
+    x, y = (np.arange(low[k] + 0.5 * fine_mm, high[k], fine_mm) for k in (0, 1))
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    around, near = cKDTree(points_mm[:, :2]).query(grid, k=5)
-    heights = points_mm[near, 2]
-    middle = np.median(heights, axis=1)
-    # Light leaves holes at the foot of a wall only: a cell far from any point belongs to the plate.
-    on_top = (middle > RAISED_MM) & (around[:, 0] < 2 * facet_mm)
-    return np.column_stack([grid[on_top], middle[on_top]])
+    inside = np.all((points_mm[:, :2] > low - 2) & (points_mm[:, :2] < high + 2), axis=1)
+    near = points_mm[inside]
+    apart, nearest = cKDTree(near[:, :2]).query(grid)
+    # Light leaves holes at the foot of a wall only: what is far from any point belongs to the plate.
+    on_top = (near[nearest, 2] > RAISED_MM) & (apart < facet_mm)
+    cell = np.floor((grid[on_top] - low) / facet_mm).astype(np.int64)
+    _, group, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
+    group = group.ravel()
+    columns = [grid[on_top, 0], grid[on_top, 1], near[nearest[on_top], 2]]
+    centres = np.column_stack([np.bincount(group, c) / count for c in columns])
+    return centres, count * fine_mm**2
 
 
 def _moved(rig_from_robot: Matrix, offsets: NDArray[np.float64]) -> Matrix:
@@ -96,11 +110,11 @@ def fit_block(
     """
     if not pings:
         raise CalibrationRejectedError(f"array calibration: no pings over a block: undetermined: {', '.join(NAMES)}")
-    facets = raised_facets(optical_points_mm)
+    facets, areas = raised_facets(optical_points_mm)
     pipeline = UltrasonicPipeline(calibration)
     samples = pings[0].echoes.shape[1]
-    predictor = BlockPredictor(calibration, facets, FACET_MM**2, samples)
-    bare = BlockPredictor(calibration, facets[:0], FACET_MM**2, samples)
+    predictor = BlockPredictor(calibration, facets, areas, samples)
+    bare = BlockPredictor(calibration, facets[:0], areas[:0], samples)
     base = calibration.robot_pose
     speeds = [speed_of_sound_mps(calibration, p.air_temperature_c) for p in pings]
     top_mm = float(facets[:, 2].max())
@@ -130,20 +144,18 @@ def fit_block(
     noise = np.sqrt(0.05 * power / size) + 1e-6
     scales = np.array([PRIOR_MM, PRIOR_MM, PRIOR_RAD])
 
-    def cost(p: NDArray[np.float64]) -> NDArray[np.float64]:
+    def residuals(p: NDArray[np.float64]) -> NDArray[np.float64]:
         rows: list[NDArray[np.float32]] = []
         for k, m in enumerate(measured):
-            difference = (m - _scaled(echoes(predictor, k, p * scales), windows[k], pings[k], pipeline)).ravel()
+            difference = (m - _scaled(echoes(predictor, k, p), windows[k], pings[k], pipeline)).ravel()
             rows.append(difference.view(np.float32))
-        return np.concatenate([np.concatenate(rows).astype(np.float64) / noise, p])
+        return np.concatenate(rows).astype(np.float64) / noise
 
-    solved = least_squares(cost, zero, diff_step=0.02, x_scale=1.0, max_nfev=12, xtol=1e-4, ftol=1e-5)
-    left = np.asarray(solved.fun)[:-3]
+    at, left, jacobian = _gauss_newton(residuals, scales)
     explained = 1.0 - float(np.sum(left**2)) * noise**2 / max(power, 1e-12)
-    jacobian = np.asarray(solved.jac)[:-3]
     # Neighbouring samples share their errors: count one independent value per compressed pulse of about 8 samples.
-    information = jacobian.T @ jacobian / (8 * max(1.0, float(np.mean(left**2)))) + np.eye(3)
-    sigmas = np.sqrt(np.diag(np.linalg.inv(information))) * scales
+    information = jacobian.T @ jacobian / (8 * max(1.0, float(np.mean(left**2)))) + np.diag(scales**-2)
+    sigmas = np.sqrt(np.diag(np.linalg.inv(information)))
     limits = (LIMIT_MM, LIMIT_MM, LIMIT_RAD)
     loose = [n for n, s, limit in zip(NAMES, sigmas, limits, strict=True) if s > limit]
     if loose or explained < 0.3:
@@ -152,8 +164,29 @@ def fit_block(
             f"array calibration: {len(pings)} pings over the block {reason}; raster across all four edges of the block "
             "that the pass 'block-light' saw, at 10 mm pitch"
         )
-    found = _moved(base, np.asarray(solved.x) * scales)
+    found = _moved(base, at)
     return BlockFit(found, dict(zip(NAMES, sigmas.tolist(), strict=True)), explained)
+
+
+def _gauss_newton(
+    residuals: Callable[[NDArray[np.float64]], NDArray[np.float64]], scales: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Least squares from zero with steps fit for single-precision waveforms: solution, residuals, Jacobian."""
+    at = np.zeros(len(scales))
+    now = residuals(at)
+    jacobian = np.zeros((len(now), len(scales)))
+    for _ in range(MAX_ITERATIONS):
+        for k, scale in enumerate(scales):
+            ahead = at.copy()
+            ahead[k] += STEP * scale
+            jacobian[:, k] = (residuals(ahead) - now) / (STEP * scale)
+        normal = jacobian.T @ jacobian + np.diag(scales**-2)
+        change = np.linalg.solve(normal, -(jacobian.T @ now) - at / scales**2)
+        at = at + np.clip(change, -scales, scales)
+        now = residuals(at)
+        if np.all(np.abs(change) < CLOSE * scales):
+            break
+    return at, now, jacobian
 
 
 def _scaled(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
@@ -15,14 +15,17 @@ from numpy.typing import NDArray
 
 from echolume_processing.ping import Ping
 from echolume_processing.ultrasonic.block import BlockFit, fit_block
-from echolume_processing.ultrasonic.pipeline import UltrasonicPipeline
-from echolume_processing.ultrasonic.plate import PlateFit, fit_plate, plate_paths
+from echolume_processing.ultrasonic.pipeline import UPSAMPLING, UltrasonicPipeline, waveforms_from_counts
+from echolume_processing.ultrasonic.plate import Levels, PlateFit, fit_plate, plate_paths
 from echolume_processing.ultrasonic.templates import Templates, cut_templates, reference_pings
 
 REFERENCE_MM = 150.0
 """Height of the perpendicular pings that become the templates, where the plan offers a choice."""
 GATE_MM = 60.0
 """The plate's echo is looked for this far around its nominal path."""
+DIRECT_MM = 60.0
+"""The direct sound arrives, electrical delay included, within this path."""
+MIN_DIRECT = 0.05
 MAX_RMS_MM = 0.3
 MIN_PINGS = 6
 
@@ -86,16 +89,37 @@ def _provisional(
     return calibration, cut, paths
 
 
-def _times(
+def _echoes(
     pings: Sequence[Ping], calibration: ArrayCalibration, paths_mm: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Arrival of the plate's echo after the emission, (pings, receivers)."""
+) -> tuple[NDArray[np.float64], Levels]:
+    """Arrival of the plate's echo after the emission, (pings, receivers), and its level."""
     pipeline = UltrasonicPipeline(calibration)
-    out = np.full(paths_mm.shape, np.nan)
+    times_s, amplitudes = np.full(paths_mm.shape, np.nan), np.full(paths_mm.shape, np.nan)
     for k, ping in enumerate(pings):
         gate = (float(paths_mm[k].min()) - GATE_MM, float(paths_mm[k].max()) + GATE_MM)
-        out[k] = pipeline.times_s(ping, gate)
-    return out
+        times_s[k], amplitudes[k] = pipeline.strongest(ping, gate)
+    frequency_hz, weights = pipeline.band_weights(pings[0].echoes.shape[1])
+    return times_s, Levels(amplitudes, frequency_hz, weights, calibration.radius_mm)
+
+
+def _direct_times(
+    pings: Sequence[Ping], chosen: list[int], calibration: ArrayCalibration
+) -> NDArray[np.float64] | None:
+    """Arrival of the direct sound after the emission (receivers,); None where the pulse is too long to tell it."""
+    pipeline = UltrasonicPipeline(calibration)
+    first = pings[chosen[0]]
+    if first.start_s > 0 or calibration.high_hz - calibration.low_hz < 0.4 * calibration.low_hz:
+        return None
+    mean = np.mean([waveforms_from_counts(pings[k].echoes) for k in chosen], axis=0, dtype=np.float32)
+    magnitude = np.abs(pipeline.compress(np.asarray(mean, dtype=np.float32), first.sample_rate_hz))
+    rate_hz = first.sample_rate_hz * UPSAMPLING
+    early = magnitude[:, : int(DIRECT_MM / (1e3 * calibration.speed_of_sound_mps) * rate_hz)]
+    peak = np.clip(np.argmax(early, axis=1), 1, early.shape[1] - 2)
+    rows = np.arange(len(early))
+    left, middle, right = early[rows, peak - 1], early[rows, peak], early[rows, peak + 1]
+    clear = (middle >= left) & (middle > right) & (middle > MIN_DIRECT)
+    shift = 0.5 * (left - right) / np.where(clear, left - 2 * middle + right, -1.0)
+    return np.where(clear, (peak + shift) / rate_hz, np.nan)
 
 
 def calibrate_plate(pings: Sequence[Ping], settings: ArraySettings) -> ArrayResult:
@@ -111,12 +135,18 @@ def calibrate_plate(pings: Sequence[Ping], settings: ArraySettings) -> ArrayResu
             f"array calibration: the pass 'plate' has {len(pings)} pings, {MIN_PINGS} are needed"
         )
     nominal = nominal_flange_from_array(settings)
-    provisional, _, paths = _provisional(pings, settings, nominal)
-    times = _times(pings, provisional, paths)
+    provisional, cut, paths = _provisional(pings, settings, nominal)
+    times, levels = _echoes(pings, provisional, paths)
+    direct = _direct_times(pings, cut.pings, provisional)
     poses = np.array([p.robot_pose for p in pings])
     temperatures = np.array([p.air_temperature_c for p in pings])
     emitter, receivers = np.array(provisional.emitter_mm), np.array(provisional.receivers_mm)
-    fit = fit_plate(poses, times, temperatures, emitter, receivers, nominal)
+
+    def fitted(kept: NDArray[np.bool_]) -> PlateFit:
+        part = replace(levels, amplitudes=levels.amplitudes[kept])
+        return fit_plate(poses[kept], times[kept], temperatures[kept], emitter, receivers, nominal, direct, part)
+
+    fit = fitted(np.ones(len(pings), dtype=np.bool_))
     good = np.sqrt(np.nanmean(fit.residuals_mm**2, axis=1)) < max(MAX_RMS_MM, 4 * float(np.median(np.abs(fit.residuals_mm))))
     if np.count_nonzero(good) < MIN_PINGS or np.count_nonzero(good) < 0.7 * len(pings):
         raise CalibrationRejectedError(
@@ -124,16 +154,17 @@ def calibrate_plate(pings: Sequence[Ping], settings: ArraySettings) -> ArrayResu
             f"{fit.path_rms_mm:.2f} mm); is the bench bare and flat, and the nominal mounting of the array right?"
         )
     if not good.all():
-        fit = fit_plate(poses[good], times[good], temperatures[good], emitter, receivers, nominal)
+        fit = fitted(good)
     if fit.path_rms_mm > MAX_RMS_MM:
         raise CalibrationRejectedError(
             f"array calibration: paths over the plate scatter by {fit.path_rms_mm:.2f} mm rms, at most {MAX_RMS_MM} is "
             "accepted; is the bench bare and flat?"
         )
-    array_pose = fit.rig_from_robot @ robot_from_flange(poses[reference_pings(pings, nominal[:3, 2], REFERENCE_MM)[0]])
+    array_pose = fit.rig_from_robot @ robot_from_flange(poses[cut.pings[0]])
     array_pose = array_pose @ fit.flange_from_array
     calibration = msgspec.structs.replace(
         provisional,
+        radius_mm=fit.radius_mm,
         delays_s=fit.delays_s.tolist(),
         reference_mm=float((array_pose[:3, :3] @ emitter + array_pose[:3, 3])[2]),
         speed_of_sound_mps=fit.speed_mps,

@@ -106,6 +106,9 @@ class MatchedFilter:
     centre_hz: NDArray[np.float64]
     bandwidth_hz: NDArray[np.float64]
     """Effective (rms) bandwidth about the centre, per channel."""
+    frequency_hz: NDArray[np.float64]
+    response: NDArray[np.float64]
+    """Share of the compressed pulse at each of twelve frequencies, mean of all channels."""
 
     def compress(self, waveforms: Waveforms) -> ComplexEnvelope:
         """Complex matched-filter output, shape (receivers, upsampling * samples)."""
@@ -162,7 +165,18 @@ def matched_filter(
     spread = (response * (frequency_hz - centre_hz[:, None]) ** 2).sum(axis=1) / total[:, 0]
     # One-sided sum / total = 1 at the arrival; ifft divides by its length.
     weights = inverse * (length * upsampling) / total
-    return MatchedFilter(weights.astype(np.complex64), length, upsampling, centre_hz, np.sqrt(spread))
+    inside = np.flatnonzero(taper > 0)
+    pieces = np.array_split(inside, 12)
+    share = (response / total).mean(axis=0)
+    return MatchedFilter(
+        weights.astype(np.complex64),
+        length,
+        upsampling,
+        centre_hz,
+        np.sqrt(spread),
+        np.array([frequency_hz[p].mean() for p in pieces]),
+        np.array([share[p].sum() for p in pieces]),
+    )
 
 
 def energy(envelope: NDArray[np.float32], sample_rate_hz: float) -> NDArray[np.float64]:

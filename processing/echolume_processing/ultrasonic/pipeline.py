@@ -107,13 +107,18 @@ class UltrasonicPipeline:
         found = first_arrivals(compressed, bank, rate_hz, gate, threshold, strongest=strongest)
         return found, (found.time_s + start_s - self._delays_s) * speed
 
-    def times_s(self, ping: Ping, gate_mm: tuple[float, float]) -> NDArray[np.float64]:
-        """Arrival of the strongest echo within a gate of path, after the emission, delay included (receivers,)."""
+    def strongest(self, ping: Ping, gate_mm: tuple[float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Arrival after the emission (delay included) and amplitude of the strongest echo in a gate, (receivers,)."""
         waveforms = waveforms_from_counts(ping.echoes)
         found, _ = self.arrivals(
             waveforms, ping.sample_rate_hz, ping.start_s, ping.air_temperature_c, strongest=True, gate_mm=gate_mm
         )
-        return found.time_s + ping.start_s
+        return found.time_s + ping.start_s, found.amplitude
+
+    def band_weights(self, samples: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Frequencies (n,) in Hz and how much of the compressed pulse lies at each (n,), their sum 1."""
+        bank = self._bank(samples, self.calibration.sample_rate_hz)
+        return bank.frequency_hz, bank.response
 
     def process_echoes(
         self,

@@ -13,6 +13,8 @@ from echolume_messages.geometry import Matrix, Points3, robot_from_flange, rotat
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from echolume_processing.ultrasonic.acoustics import directivity
+
 CHANNEL_SIGMA_MM = 0.02
 """What a channel's path scatters by itself."""
 COMMON_SIGMA_MM = 0.05
@@ -21,6 +23,11 @@ MOUNTING_SIGMA_MM = 1.0
 MOUNTING_SIGMA_RAD = float(np.radians(1.0))
 """How well the array and the robot are mounted by hand: the nominal values are believed this far."""
 SPEED_SIGMA = 0.01
+LEVEL_SIGMA = 0.015
+"""Of the natural logarithm of a ping's amplitude, averaged over its channels: air, and scatter of the plate."""
+RADIUS_SIGMA = 0.05
+DIRECT_SIGMA_MM = 0.5
+"""How far the direct sound, which leaves the piston sideways, is believed to come from its centre."""
 
 NAMES = (
     "flange_from_array x",
@@ -50,7 +57,11 @@ class PlateFit:
     """At `temperature_c`."""
     temperature_c: float
     delays_s: NDArray[np.float64]
+    radius_mm: float
+    """Effective radius of the transducers, from how the echo weakens with tilt."""
     path_rms_mm: float
+    level_rms: float
+    """Of the logarithm of the amplitude."""
     sigmas: dict[str, float]
     """Standard deviation by name: mm, rad, and m/s."""
     residuals_mm: NDArray[np.float64]
@@ -73,6 +84,42 @@ def plate_paths(rig_from_array: NDArray[np.float64], emitter_mm: NDArray[np.floa
     return np.linalg.norm(receivers - image[:, None, :], axis=2)
 
 
+@dataclass(frozen=True)
+class Levels:
+    """Amplitude of each ping relative to the reference plate, and over which frequencies it was taken."""
+
+    amplitudes: NDArray[np.float64]  # (pings, receivers)
+    frequency_hz: NDArray[np.float64]  # (m,)
+    weights: NDArray[np.float64]  # (m,), their sum is 1
+    radius_mm: float
+    """Nominal."""
+
+
+def plate_levels(
+    rig_from_array: NDArray[np.float64],
+    emitter_mm: NDArray[np.float64],
+    receivers_mm: Points3,
+    wavenumbers: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    radius_mm: float,
+) -> NDArray[np.float64]:
+    """Directivity both ways over path, of the plate z = 0 at array poses (pings, 4, 4): (pings, receivers), 1/mm."""
+    mirror = np.array([1.0, 1.0, -1.0])
+    rotation = rig_from_array[:, :3, :3]
+    emitter = rotation @ emitter_mm + rig_from_array[:, :3, 3]
+    receivers = np.einsum("pij,rj->pri", rotation, receivers_mm) + rig_from_array[:, None, :3, 3]
+    way = receivers - (emitter * mirror)[:, None, :]
+    path = np.linalg.norm(way, axis=2)
+    axis = rotation[:, :, 2]
+    out = np.zeros(path.shape)
+    cosines = [np.einsum("pri,pi->pr", w, axis) / path for w in (way, way * mirror)]
+    sines = [np.sqrt(np.maximum(1 - c**2, 0.0)) for c in cosines]
+    for wavenumber, weight in zip(wavenumbers.tolist(), weights.tolist(), strict=True):
+        ka = wavenumber * radius_mm
+        out += weight * directivity(ka * sines[0]) * directivity(ka * sines[1])
+    return out / path
+
+
 def _whitening(n: int) -> NDArray[np.float64]:
     covariance = CHANNEL_SIGMA_MM**2 * np.eye(n) + COMMON_SIGMA_MM**2 * np.ones((n, n))
     values, vectors = np.linalg.eigh(covariance)
@@ -86,8 +133,8 @@ def fit_plate(
     emitter_mm: NDArray[np.float64],
     receivers_mm: Points3,
     nominal_flange_from_array: Matrix,
-    *,
-    allow_undetermined: bool = False,
+    direct_s: NDArray[np.float64] | None = None,
+    levels: Levels | None = None,
 ) -> PlateFit:
     """Fit everything that pings over the reference plate can tell.
 
@@ -100,6 +147,11 @@ def fit_plate(
     temperatures_c : (pings,) float64
     emitter_mm, receivers_mm : (3,), (receivers, 3) float64
     nominal_flange_from_array : (4, 4) float64
+    direct_s : (receivers,) float64, optional
+        Arrival of the direct sound emitter -> receiver; it tells the channels' common delay, which the plate alone
+        hardly separates from the height. Not a number where unknown.
+    levels : Levels, optional
+        Amplitudes; they tell the array's tilt, which paths hardly separate from the channels' delays, and the radius.
 
     Raises
     ------
@@ -126,26 +178,55 @@ def fit_plate(
         flange, rig = _poses(p[:9] * sigmas[:9], nominal_flange_from_array)
         speed = (nominal_speed + p[9] * sigmas[9]) * scale[:, None] * 1e3
         paths = plate_paths(rig @ robot @ flange, emitter_mm, receivers_mm)
-        delays_mm = p[10:]
+        delays_mm = p[11:]
         return np.where(known, np.nan_to_num(times_s) * speed - delays_mm - paths, 0.0)
 
-    def cost(p: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.concatenate([(residuals_mm(p) @ whiten).ravel(), p[:10]])
+    direct = np.full(n_receivers, np.nan) if direct_s is None else direct_s
+    heard = np.isfinite(direct)
+    apart_mm = np.linalg.norm(receivers_mm - emitter_mm, axis=1)
 
-    start = np.zeros(10 + n_receivers)
-    start[10:] = np.nanmedian(np.where(known, residuals_mm(start), np.nan), axis=0)
+    def common_mm(p: NDArray[np.float64]) -> float:
+        if not heard.any():
+            return 0.0
+        speed = (nominal_speed + p[9] * sigmas[9]) * 1e3
+        return float(np.mean((direct * speed - apart_mm - p[11:])[heard]))
+
+    heights = np.full(len(poses), np.nan) if levels is None else np.log(np.nanmean(levels.amplitudes, axis=1))
+    loud = np.isfinite(heights)
+
+    def level_residuals(p: NDArray[np.float64]) -> NDArray[np.float64]:
+        if levels is None:
+            return np.zeros(0)
+        flange, rig = _poses(p[:9] * sigmas[:9], nominal_flange_from_array)
+        model = plate_levels(
+            (rig @ robot @ flange)[loud],
+            emitter_mm,
+            receivers_mm,
+            2e-3 * np.pi * levels.frequency_hz / nominal_speed,
+            levels.weights,
+            levels.radius_mm * (1 + RADIUS_SIGMA * float(p[10])),
+        )
+        difference = heights[loud] - np.log(model.mean(axis=1))
+        return difference - np.median(difference)
+
+    def cost(p: NDArray[np.float64]) -> NDArray[np.float64]:
+        paths = (residuals_mm(p) @ whiten).ravel()
+        return np.concatenate([paths, level_residuals(p) / LEVEL_SIGMA, [common_mm(p) / DIRECT_SIGMA_MM], p[:11]])
+
+    start = np.zeros(11 + n_receivers)
+    start[11:] = np.nanmedian(np.where(known, residuals_mm(start), np.nan), axis=0)
     solved = least_squares(cost, start, loss="soft_l1", f_scale=3.0, x_scale="jac", max_nfev=60)
     found = np.asarray(solved.x, dtype=np.float64)
     jacobian = np.asarray(solved.jac, dtype=np.float64)
     left = residuals_mm(found)
     rms = float(np.sqrt(np.mean(left[known] ** 2)))
     expected = np.hypot(CHANNEL_SIGMA_MM, COMMON_SIGMA_MM)
-    data = jacobian[:-10]
+    data = jacobian[:-11]
     information = data.T @ data / max(1.0, (rms / expected) ** 2)
-    information[:10, :10] += np.eye(10)
+    information[:11, :11] += np.eye(11)
     spread = np.sqrt(np.diag(np.linalg.inv(information)))[:10]
     loose = [n for n, s in zip(NAMES, spread, strict=True) if s > DETERMINED and n not in FREE]
-    if False:
+    if loose:
         raise CalibrationRejectedError(
             f"array calibration: {len(poses)} pings over the plate leave undetermined: {', '.join(loose)}; "
             "add poses tilted by 5 to 12 degrees about both axes, at several heights and places"
@@ -157,8 +238,10 @@ def fit_plate(
         rig,
         speed_mps,
         temperature_c,
-        found[10:] / (1e3 * speed_mps),
+        found[11:] / (1e3 * speed_mps),
+        (levels.radius_mm if levels is not None else 0.0) * (1 + RADIUS_SIGMA * float(found[10])),
         rms,
+        float(np.sqrt(np.mean(level_residuals(found) ** 2))) if levels is not None else 0.0,
         dict(zip(NAMES, (spread * sigmas).tolist(), strict=True)),
         left,
     )

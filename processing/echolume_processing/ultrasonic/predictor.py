@@ -28,14 +28,16 @@ class BlockPredictor:
     calibration : ArrayCalibration
     centres_mm : (facets, 3) float64
         Centres of the raised, horizontal facets, rig frame.
-    area_mm2 : float
-        Of each facet.
+    area_mm2 : (facets,) float64
     """
 
-    def __init__(self, calibration: ArrayCalibration, centres_mm: Points3, area_mm2: float, samples: int) -> None:
+    def __init__(
+        self, calibration: ArrayCalibration, centres_mm: Points3, area_mm2: NDArray[np.float64], samples: int
+    ) -> None:
         found = self._calibration = calibration
-        self._centres_mm = centres_mm
-        self._area_mm2 = area_mm2
+        floor = centres_mm * np.array([1.0, 1.0, 0.0])
+        self._centres_mm = np.concatenate([centres_mm, floor])
+        self._area_mm2 = np.concatenate([area_mm2, -area_mm2])
         self._samples = samples
         self._rate_hz = found.sample_rate_hz
         self._length = fft.next_fast_len(samples + len(found.templates[0]), real=True)
@@ -58,9 +60,7 @@ class BlockPredictor:
         axis = rotation[:, 2]
         response = self._image(emitter, receivers, axis, ka, speed, start_s)
         if len(self._centres_mm):
-            floor = self._centres_mm * np.array([1.0, 1.0, 0.0])
-            response = response + self._facets(self._centres_mm, emitter, receivers, axis, ka, speed, start_s)
-            response = response - self._facets(floor, emitter, receivers, axis, ka, speed, start_s)
+            response = response + self._facets(emitter, receivers, axis, ka, speed, start_s)
         out: Waveforms = np.asarray(fft.irfft(self._source * response, self._length, axis=1), dtype=np.float32)
         return out[:, : self._samples]
 
@@ -84,7 +84,6 @@ class BlockPredictor:
 
     def _facets(
         self,
-        centres: Points3,
         emitter: NDArray[np.float64],
         receivers: Points3,
         axis: NDArray[np.float64],
@@ -92,6 +91,7 @@ class BlockPredictor:
         speed: float,
         start_s: float,
     ) -> NDArray[np.complex128]:
+        centres = self._centres_mm
         down = centres - emitter
         there = np.linalg.norm(down, axis=1)
         level_out = _directivity(np.sqrt(np.maximum(1 - (down @ axis / there) ** 2, 0.0)), ka) / there

@@ -89,6 +89,7 @@ class Acquisition:
                 if dead:
                     raise NoReplyError(f"not running: {', '.join(dead)}; start them with `echolume serve NAME`")
                 raise DeviceAbsentError("; ".join(ill))
+            self.gate()
             with self.changed:
                 self.changed.wait(0.1)
 
@@ -174,7 +175,7 @@ class Acquisition:
         try:
             self._ask("guide", "expose", {"x_mm": step.guide_x_mm, "exposure_s": step.exposure_s}, 20.0)
         except EcholumeError:
-            self._quietly("cameras", "disarm")
+            _quietly(self.bus, "cameras", "disarm")
             raise
 
     def _ping(self, step: Step, attempt: int) -> None:
@@ -260,28 +261,30 @@ class Acquisition:
     def _ask(self, service: str, command: str, body: Json, timeout_s: float = 5.0) -> Json:
         return self.bus.request(service, command, body, timeout_s)
 
-    def _quietly(self, service: str, command: str, timeout_s: float = 2.0) -> None:
-        """A command whose failure changes nothing about what is done next; it is logged."""
-        try:
-            self._ask(service, command, {}, timeout_s)
-        except EcholumeError as error:
-            _log.warning("%s.%s: %s", service, command, error)
 
-    def make_safe(self, kinds: Iterable[str], *, at_once: bool) -> None:
-        """Laser off, trigger unit disarmed; `at_once`: stop guide and robot where they are. All side by side."""
-        wanted = {name for kind in kinds for name in SERVICES_OF[kind]}
-        commands = [("guide", "stop" if at_once else "laser_off"), ("cameras", "disarm")]
-        if at_once:
-            commands.append(("robot", "stop"))
-        threads = [
-            threading.Thread(target=self._quietly, args=pair, name=f"safe-{pair[0]}", daemon=True)
-            for pair in commands
-            if pair[0] in wanted
-        ]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join(3.0)
+def make_safe(bus: Bus, kinds: Iterable[str], *, at_once: bool) -> None:
+    """Laser off, trigger unit disarmed; `at_once`: stop guide and robot where they are. All side by side."""
+    wanted = {name for kind in kinds for name in SERVICES_OF[kind]}
+    commands = [("guide", "stop" if at_once else "laser_off"), ("cameras", "disarm")]
+    if at_once:
+        commands.append(("robot", "stop"))
+    threads = [
+        threading.Thread(target=_quietly, args=(bus, *pair), name=f"safe-{pair[0]}", daemon=True)
+        for pair in commands
+        if pair[0] in wanted
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(3.0)
+
+
+def _quietly(bus: Bus, service: str, command: str) -> None:
+    """A command whose failure changes nothing about what is done next; it is logged."""
+    try:
+        bus.request(service, command, {}, 2.0)
+    except EcholumeError as error:
+        _log.warning("%s.%s: %s", service, command, error)
 
 
 def _named(records: Iterable[Expected]) -> str:

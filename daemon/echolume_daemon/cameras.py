@@ -241,9 +241,8 @@ class CamerasService:
             out["scan"] = self._scan
             out["missing"] = [[e.topic.name, m.trigger, m.attempt] for e in self._eyes for m in e.missing]
             out["revoked"] = [[e.topic.name, m.trigger, m.attempt] for e in self._eyes for m in e.matcher.revoked]
-            out["counts"] = [
-                [name, kind, n] for (name, kind), n in sum((e.counts for e in self._eyes), Counter()).items()
-            ]
+            counts = self._eyes[0].counts + self._eyes[1].counts
+            out["counts"] = [[name, kind, n] for (name, kind), n in counts.items()]
         return out
 
     # -- loops

@@ -108,6 +108,7 @@ class ScanClient:
         NoReplyError
             The conductor has been silent for 10 s.
         """
+        ledger: Json | None = None
         heard_s = poll_s = time.monotonic()
         told = False
         while True:
@@ -118,22 +119,22 @@ class ScanClient:
             states: list[Json] = []
             if message is not None and message.header.scan == self.scan:
                 heard_s = now_s
-                final = self._final(message)
-                if final is not None:
-                    return final
+                ledger = self._final(message) or ledger
                 if message.topic is RUN_STATE:
                     states.append(cast(Json, message.json()))
             if now_s >= poll_s:
                 poll_s = now_s + _POLL_S
                 status = self._poll()
                 heard_s = heard_s if status is None else now_s
-                if status is not None and self._is_final(status.get("ledger")):
+                if status is not None and status.get("state") == "idle" and self._is_final(status.get("ledger")):
                     return cast(Json, status["ledger"])
                 if status is not None and status.get("scan") == self.scan:
                     states.append(status)
             if now_s - heard_s > _SILENCE_S:
                 raise NoReplyError(f"conductor: silent for {_SILENCE_S:.0f} s in mid scan {self.scan}; is it running?")
             for state in states:
+                if ledger is not None and state.get("state") == "idle":
+                    return ledger
                 self._show(state, on_state, on_prompt)
 
     def _show(

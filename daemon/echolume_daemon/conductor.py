@@ -10,7 +10,7 @@ from typing import cast
 
 import msgspec
 
-from echolume_daemon.acquisition import Acquisition, Interrupted
+from echolume_daemon.acquisition import SERVICES_OF, Acquisition, Interrupted, make_safe
 from echolume_daemon.body import text
 from echolume_daemon.lease import Lease
 from echolume_daemon.ledger import Ledger
@@ -75,9 +75,14 @@ class Conductor:
             self._error = error or self._error
             self._changed.notify_all()
             self._publish()
-        self._service.log.info(
-            "%s -> %s (%s)%s", before, self._state, event, f": {error or prompt}" * bool(error or prompt)
-        )
+        why = f": {error or prompt}" if error or prompt else ""
+        self._service.log.info("%s -> %s (%s)%s", before, self._state, event, why)
+
+    def advance(self, event: Event, *, prompt: str = "") -> None:
+        """Pass the gate, then follow the state table, with nobody in between."""
+        with self._changed:
+            self.gate()
+            self.happen(event, prompt=prompt)
 
     def gate(self) -> None:
         """Wait while paused; raise `Interrupted` when the scan is to end."""
@@ -111,6 +116,9 @@ class Conductor:
         except EcholumeError as error:
             self._refuse(str(error))
             raise
+        except Interrupted:
+            self._refuse("")
+            raise WrongStateError("conductor: the scan was ended while it was arming") from None
         except Exception as error:
             self._refuse(f"internal error: {error!r}")
             raise
@@ -167,9 +175,7 @@ class Conductor:
         except WrongStateError:
             if self._state is not RunState.IDLE:
                 raise
-        kinds = run.kinds if run is not None else ["optical", "ultrasonic"]
-        if run is not None:
-            run.acquisition.make_safe(kinds, at_once=True)
+        make_safe(self._service.bus, SERVICES_OF if run is None else run.kinds, at_once=True)
         self._service.log.warning("halted by %s", text(body, "holder", "somebody"))
         return self._snapshot()
 

@@ -11,7 +11,6 @@ from typing import Literal, NamedTuple, TypeAlias
 import msgspec
 
 from echolume_messages import archive
-from echolume_messages.bus import Message
 from echolume_messages.errors import ArchiveError
 from echolume_messages.plan import Plan, Step, expand
 from echolume_messages.topics import PASS_STREAMS, SCAN_START
@@ -29,6 +28,12 @@ class Expected(NamedTuple):
     topic: str
     trigger: int
     attempt: int
+
+
+class _Start(msgspec.Struct):
+    """What the ledger needs of ``conductor/start``."""
+
+    plan: Plan
 
 
 @dataclass
@@ -66,18 +71,18 @@ class Ledger:
             It is no archive, or the start of its scan is not in it.
         """
         plan: Plan | None = None
-        records: list[Message] = []
+        records: list[Expected] = []
         for message in archive.read(path, topics={SCAN_START.name, *RAW_STREAMS}):
             if message.topic.name == SCAN_START.name:
-                plan = msgspec.convert(message.json()["plan"], Plan)
+                plan = msgspec.convert(message.json(), _Start).plan
             else:
-                records.append(message)
+                records.append(Expected(message.header.stream, message.header.trigger, message.header.attempt))
         if plan is None:
             raise ArchiveError(f"{path}: holds no start of a scan, so its plan is unknown; start the scan anew")
         ledger = cls(expand(plan))
-        for message in records:
-            ledger.fired(message.header.trigger, message.header.attempt)
-            ledger.durable(message.header.stream, message.header.trigger, message.header.attempt)
+        for record in records:
+            ledger.fired(record.trigger, record.attempt)
+            ledger.durable(*record)
         return ledger, plan
 
     def fired(self, trigger: int, attempt: int) -> None:

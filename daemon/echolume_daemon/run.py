@@ -12,7 +12,7 @@ from typing import Protocol
 
 import msgspec
 
-from echolume_daemon.acquisition import Acquisition, Interrupted, Json
+from echolume_daemon.acquisition import Acquisition, Interrupted, Json, make_safe
 from echolume_daemon.ledger import Outcome
 from echolume_daemon.states import Event
 from echolume_messages.bus import Bus, Publisher
@@ -32,8 +32,8 @@ class Stage(Protocol):
         """Follow the state table."""
         ...
 
-    def gate(self) -> None:
-        """Wait while paused; raise `Interrupted` when the scan is to end."""
+    def advance(self, event: Event, *, prompt: str = "") -> None:
+        """Wait while paused, raise `Interrupted` when the scan is to end, else follow the state table."""
         ...
 
     def enter(self, pass_name: str, kind: str) -> None:
@@ -79,13 +79,13 @@ class ScanRun:
         outcome: Outcome = "failed"
         try:
             self._acquire()
-            self.stage.happen(Event.DONE)
+            self.stage.advance(Event.DONE)
             outcome = "complete" if self.acquisition.ledger.complete() else "incomplete"
         except Interrupted:
             outcome = "aborted"
         except EcholumeError as error:
             self._fail(str(error))
-        except Exception as error:
+        except Exception as error:  # noqa: BLE001  the operator is told, the ledger still closes
             _log.exception("scan %s", self.scan)
             self._fail(f"internal error: {error!r}")
         finally:
@@ -105,8 +105,7 @@ class ScanRun:
         )
         for kind in self.kinds:
             self.acquisition.prepare(kind)
-        self.stage.gate()
-        self.stage.happen(Event.ARMED)
+        self.stage.advance(Event.ARMED)
         for item in self.plan.passes:
             self._pass(item.name)
 
@@ -119,8 +118,7 @@ class ScanRun:
         self.stage.enter(name, missing[0].kind)
         prompt = next((s.prompt for s in acquisition.ledger.steps if s.pass_name == name and s.prompt), "")
         if prompt:
-            self.stage.gate()
-            self.stage.happen(Event.PROMPT, prompt=prompt)
+            self.stage.advance(Event.PROMPT, prompt=prompt)
         for _ in range(max(1, self.plan.max_attempts)):
             acquisition.run(missing)
             missing = acquisition.drain(name)
@@ -141,7 +139,7 @@ class ScanRun:
         return self._ledgers.put_json(report, scan=self.scan)
 
     def _finish(self, outcome: Outcome) -> None:
-        self.acquisition.make_safe(self.kinds, at_once=False)
+        make_safe(self.bus, self.kinds, at_once=False)
         self._await(lambda: not self.acquisition.ledger.open)
         seq = self._publish(outcome, final=True)
         self._await(lambda: self.acquisition.durable_seq.get(LEDGER.name, -1) >= seq)

@@ -30,9 +30,7 @@ COLUMNS = ("planned", "fired", "matched", "missing", "duplicate", "extra")
 def configure(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("plan", type=Path, metavar="PLAN", help="scan plan (TOML)")
-    parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="where raw.mcap goes (default: the recorder's directory)"
-    )
+    parser.add_argument("--out", type=Path, metavar="DIR", help="where raw.mcap goes (default: as the recorder)")
     parser.add_argument("--json", action="store_true", help="print the ledger as JSON")
     add_rig(parser)
     add_holder(parser)

@@ -12,6 +12,7 @@ import zenoh
 from echolume_messages import topics
 from echolume_messages.bus.commands import CommandServer, Handler, request
 from echolume_messages.bus.journal import Journal
+from echolume_messages.bus.journal_server import JournalServer, JournalSource
 from echolume_messages.bus.publisher import Outbox, Publisher
 from echolume_messages.bus.session import open_client
 from echolume_messages.bus.subscription import Subscription
@@ -31,7 +32,7 @@ class Bus:
         self._outbox = Outbox(session, limit_bytes)
         self._publishers: dict[str, Publisher] = {}
         self._subscriptions: list[Subscription] = []
-        self._servers: list[CommandServer] = []
+        self._servers: list[CommandServer | JournalServer] = []
         self._tokens: dict[str, zenoh.LivelinessToken] = {}
         self._watchers: list[tuple[zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]], threading.Thread]] = []
         self._closed = False
@@ -74,6 +75,11 @@ class Bus:
         EcholumeError of a handler is sent back as the refusal. A command whose sender no longer waits is not executed.
         """
         self._servers.append(CommandServer(self._session, self.rig, service, handlers))
+
+    def serve_archive(self, wanted: Sequence[Topic], source: JournalSource) -> None:
+        """Answer subscribers that miss records which have left their publisher's journal; the recorder calls it."""
+        for topic in wanted:
+            self._servers.append(JournalServer(self._session, self.rig, "journal/archive", topic, source))
 
     def request(
         self, service: str, command: str, body: Mapping[str, object] | None = None, timeout_s: float = 5.0

@@ -14,7 +14,8 @@ import zenoh
 from numpy.typing import NDArray
 
 from echolume_messages import topics
-from echolume_messages.bus.journal import REPLY_RECORDS, Journal, Record
+from echolume_messages.bus.journal import Journal, Record
+from echolume_messages.bus.journal_server import JSON_ENCODING, Beat, JournalServer, journal_key
 from echolume_messages.codec import ENCODING, check, encode, encode_header, json_array
 from echolume_messages.errors import BusError
 from echolume_messages.header import Header, Source
@@ -24,14 +25,9 @@ QUEUE_RECORDS = 512
 BEAT_FIRST_NS = 100_000_000
 BEAT_NS = 1_000_000_000
 DRAIN_S = 2.0
-
-
-class Beat(msgspec.Struct, forbid_unknown_fields=True):
-    """What a publisher tells of a stream while it is quiet, so that a lost last record is noticed."""
-
-    boot: str
-    first: int
-    last: int
+QUIET_NS = 150_000_000
+"""A session that closes stays until nobody has asked its journal for this long, for at most LINGER_S."""
+LINGER_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -78,14 +74,18 @@ class Outbox:
             return sum(1 for item in self._queue if item.publisher is publisher)
 
     def close(self) -> None:
-        """Send what is queued, for at most DRAIN_S, and end the thread."""
+        """Send what is queued, for at most DRAIN_S, end the thread, and stay while subscribers still refill."""
         with self._wake:
             self._closing = True
             self._wake.notify()
         self._thread.join(DRAIN_S)
+        deadline_ns = time.monotonic_ns() + round(LINGER_S * 1e9)
+        pause = threading.Event()
+        while time.monotonic_ns() < deadline_ns and any(p.busy() for p in self._publishers):
+            pause.wait(0.01)
 
     def _next(self) -> tuple[_Outgoing | None, list[Publisher]]:
-        """The next record to send, or the publishers whose beat is due; both empty at the end."""
+        """The next record to send, or the publishers whose beat is due (at the end: those just used)."""
         with self._wake:
             while True:
                 if self._queue:
@@ -93,7 +93,7 @@ class Outbox:
                     self._size -= item.record.size
                     return item, []
                 if self._closing:
-                    return None, []
+                    return None, [p for p in self._publishers if p.busy()]
                 now_ns = time.monotonic_ns()
                 due = [p for p in self._publishers if p.beat_due_ns <= now_ns]
                 if due:
@@ -106,18 +106,18 @@ class Outbox:
             item, due = self._next()
             if item is not None:
                 self._send(item.record.key, item.record.payload, item.record.header, ENCODING)
-            elif due:
-                for publisher in due:
-                    self._beat(publisher)
-            else:
+                continue
+            for publisher in due:
+                self._beat(publisher)
+            if self._closing and not self._queue:
                 return
 
     def _beat(self, publisher: Publisher) -> None:
         publisher.beat_due_ns = time.monotonic_ns() + BEAT_NS
         beat = publisher.beat()
         if beat is not None:
-            key = meta_key(publisher.rig, "meta", publisher.topic)
-            self._send(key, msgspec.json.encode(beat), None, "application/json")
+            key = journal_key(publisher.rig, "meta", publisher.topic)
+            self._send(key, msgspec.json.encode(beat), None, JSON_ENCODING)
 
     def _send(self, key: str, payload: bytes, header: bytes | None, encoding: str) -> None:
         # A put that fails is a drop: the journal has the record, and the reconnecting session will carry the refill.
@@ -140,18 +140,14 @@ class Publisher:
         self.topic = topic
         self.rig = rig
         self.beat_due_ns = time.monotonic_ns() + BEAT_NS
+        self._active_ns = 0
         self._boot = boot
         self._outbox = outbox
         self._journal = journal
         self._seq = 0
         self._dropped = 0
         self._lock = threading.Lock()
-        self._key = meta_key(rig, "journal/live", topic)
-        self._queryable = session.declare_queryable(self._key, zenoh.handlers.FifoChannel(32))
-        self._thread = threading.Thread(
-            target=self._answer, args=(self._queryable.handler,), name=f"journal-{topic.name}", daemon=True
-        )
-        self._thread.start()
+        self._server = JournalServer(session, rig, "journal/live", topic, _OwnJournal(journal, boot))
         outbox.register(self)
 
     def put(
@@ -209,6 +205,7 @@ class Publisher:
             self._journal.add(self.topic.name, record)
             self._seq += 1
             self.beat_due_ns = now_ns + BEAT_FIRST_NS
+            self._active_ns = now_ns
         return seq
 
     def put_json(
@@ -250,6 +247,10 @@ class Publisher:
         """Note that a record left the queue unsent."""
         self._dropped += 1
 
+    def busy(self) -> bool:
+        """Whether a record was put or asked for a moment ago."""
+        return time.monotonic_ns() - max(self._active_ns, self._server.asked_ns) < QUIET_NS
+
     def beat(self) -> Beat | None:
         """First and last sequence number in the journal; None before the first record."""
         span = self._journal.span(self.topic.name)
@@ -257,36 +258,20 @@ class Publisher:
 
     def undeclare(self) -> None:
         """Stop answering; `Bus.close` calls it."""
-        self._queryable.undeclare()
-        self._thread.join(1.0)
-
-    def _answer(self, handler: zenoh.handlers.Handler[zenoh.Query]) -> None:
-        """Answer the journal's queries until the queryable is undeclared."""
-        while True:
-            try:
-                query = handler.recv()
-            except zenoh.ZError:
-                return
-            with query:
-                reply_from_journal(query, self._key, self._journal, self.topic.name, self._boot)
+        self._server.close()
 
 
-def meta_key(rig: str, tree: str, topic: Topic) -> str:
-    """Key of what is said about a stream as a whole (no shard)."""
-    return f"echolume/v1/{rig}/{tree}/{topic.name}"
+class _OwnJournal:
+    """This session's journal as a source of refills."""
 
+    def __init__(self, journal: Journal, boot: str) -> None:
+        self._journal = journal
+        self._boot = boot
 
-def reply_from_journal(query: zenoh.Query, key: str, journal: Journal, stream: str, boot: str) -> None:
-    """Answer ``?boot=..;from=..;to=..``: first what the journal spans, then the oldest records asked for."""
-    wanted = query.parameters
-    first, last = wanted.get("from", ""), wanted.get("to", "")
-    if wanted.get("boot") != boot or first is None or last is None or not (first.isdigit() and last.isdigit()):
-        return
-    span = journal.span(stream)
-    if span is None:
-        return
-    # The asker may have gone: a reply that cannot be sent is asked for again.
-    with contextlib.suppress(zenoh.ZError):
-        query.reply(key, msgspec.json.encode(Beat(boot, *span)), encoding="application/json")
-        for record in journal.select(stream, int(first), int(last), REPLY_RECORDS):
-            query.reply(key, record.payload, encoding=ENCODING, attachment=record.header)
+    def span(self, stream: str, boot: str) -> tuple[int, int] | None:
+        return self._journal.span(stream) if boot == self._boot else None
+
+    def select(self, stream: str, boot: str, first: int, last: int) -> list[tuple[bytes, bytes]]:
+        if boot != self._boot:
+            return []
+        return [(record.header, record.payload) for record in self._journal.select(stream, first, last)]

@@ -11,8 +11,8 @@ import msgspec
 import zenoh
 
 from echolume_messages import topics
+from echolume_messages.bus.journal_server import JSON_ENCODING, Beat, journal_key
 from echolume_messages.bus.message import Message
-from echolume_messages.bus.publisher import Beat, meta_key
 from echolume_messages.bus.tracker import ATTEMPTS_PROMISED, ATTEMPTS_SILENT, Track
 from echolume_messages.codec import decode, decode_header
 from echolume_messages.errors import PayloadError
@@ -63,7 +63,7 @@ class Subscription:
         for topic in wanted:
             self._listen(topics.key_all(rig, "data", topic), topic)
             if refill:
-                self._listen(meta_key(rig, "meta", topic), topic)
+                self._listen(journal_key(rig, "meta", topic), topic)
         if refill:
             self._start(threading.Thread(target=self._run_refill, name="bus-refill", daemon=True))
 
@@ -138,7 +138,7 @@ class Subscription:
     def _take(self, sample: zenoh.Sample, topic: Topic, count: str) -> Beat | None:
         """Accept a record, or return the beat that the sample is."""
         try:
-            if sample.attachment is None and str(sample.encoding) == "application/json":
+            if sample.attachment is None and str(sample.encoding) == JSON_ENCODING:
                 beat = msgspec.json.decode(sample.payload.to_bytes(), type=Beat)
                 self._notice(topic, beat)
                 return beat
@@ -248,7 +248,7 @@ class Subscription:
     def _ask(self, tree: str, track: Track, first: int, last: int) -> Beat | None:
         """Ask a journal for a gap; what it spans, or None if nobody answered."""
         topic = self._topics[track.stream]
-        key = meta_key(self._rig, tree, topic)
+        key = journal_key(self._rig, tree, topic)
         span: Beat | None = None
         try:
             replies = self._session.get(

@@ -68,8 +68,8 @@ class Acquisition:
 
     # -- before the scan, and after a service came back
 
-    def check(self, kinds: Iterable[str], wait_s: float = READY_S) -> None:
-        """Wait until every service that the passes need is alive and its devices are there.
+    def check(self, kinds: Iterable[str], wait_s: float | None = None) -> None:
+        """Wait until every service that the passes need is alive and its devices are there (at most `READY_S`).
 
         Raises
         ------
@@ -79,7 +79,7 @@ class Acquisition:
             Devices that are not there, each with its own error.
         """
         names = sorted({name for kind in kinds for name in SERVICES_OF[kind]} | {"recorder"})
-        deadline_s = time.monotonic() + wait_s
+        deadline_s = time.monotonic() + (READY_S if wait_s is None else wait_s)
         while True:
             dead = [name for name in names if name not in self.bus.alive()]
             ill = [] if dead else [text for name in names for text in self._ill(name)]
@@ -134,6 +134,14 @@ class Acquisition:
         self._ask_for_missing(at_once=True)
         with self.changed:
             return self.ledger.missing(pass_name)
+
+    def settle(self, timeout_s: float) -> None:
+        """Wait until nothing is under way any more; what is left then stays open."""
+        deadline_s = time.monotonic() + timeout_s
+        while self._open() and time.monotonic() < deadline_s:
+            self._ask_for_missing()
+            with self.changed:
+                self.changed.wait(0.05)
 
     def _attempt(self, step: Step) -> None:
         with self.changed:

@@ -137,7 +137,7 @@ class CamerasService:
                 self._changed.notify_all()
             camera.start()
 
-        slot: Slot[Camera] = Slot(name, lambda: device or _camera_driver(settings, name), prepare)
+        slot: Slot[Camera] = Slot(name, lambda: device or _camera_driver(settings, topic.stream), prepare)
         eye = _Eye(topic, slot, self._service.bus.publisher(topic))
         return eye
 
@@ -156,6 +156,7 @@ class CamerasService:
             self._scan, self._calibration = scan, calibration
             for eye in self._eyes:
                 eye.matcher.reset(forget_ids=False)
+                eye.matcher.revoked.clear()
                 eye.missing.clear()
                 eye.counts.clear()
         return {}
@@ -322,9 +323,9 @@ def _trigger_driver(settings: TriggerSettings) -> Trigger:
 
 
 def _camera_driver(settings: CameraSettings, name: str) -> Camera:
-    from echolume_drivers.cameras import open_camera
+    from echolume_drivers.cameras import make_camera
 
-    return open_camera(settings, name)
+    return make_camera(settings, name)
 
 
 def main(

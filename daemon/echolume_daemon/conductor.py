@@ -94,6 +94,11 @@ class Conductor:
             if self._state in (RunState.ABORTING, RunState.HALTING):
                 raise Interrupted
 
+    @property
+    def hurried(self) -> bool:
+        """Whether the service is about to stop."""
+        return self._service.stop.is_set()
+
     def enter(self, pass_name: str, kind: str) -> None:
         """A pass begins."""
         with self._changed:

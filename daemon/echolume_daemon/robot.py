@@ -12,7 +12,7 @@ from echolume_daemon.body import pose6
 from echolume_daemon.device import Slot
 from echolume_daemon.service import Json, Service, run_service
 from echolume_messages.bus import Bus
-from echolume_messages.errors import DeviceError
+from echolume_messages.errors import DeviceAbsentError, DeviceError
 from echolume_messages.rig import Rig, RobotSettings
 
 _COMMAND_LIMIT_S = 120.0
@@ -37,9 +37,8 @@ class RobotService:
         self._enabled = False
         self._slot = Slot("robot", lambda: device or _driver(self._settings), self._prepare, lambda d: d.pose())
         self._slot.watch(service)
-        service.serve(
-            {"enable": self._enable, "move": self._move, "stop": self._stop, "status": self._status}, _COMMAND_LIMIT_S
-        )
+        service.serve({"enable": self._enable, "move": self._move}, _COMMAND_LIMIT_S)
+        service.serve({"stop": self._stop, "status": self._status}, 15.0)
 
     def health(self) -> Json:
         """Device state."""
@@ -65,14 +64,21 @@ class RobotService:
 
     def _move(self, body: Json) -> Json:
         target = np.array(pose6(body, "pose"), dtype=np.float64)
-        with self._slot.use() as device:
-            reached = device.move(target)
+        try:
+            with self._slot.use() as device:
+                reached = device.move(target)
+        except DeviceError:
+            self._enabled = False
+            raise
         return {"pose": [float(v) for v in reached], "sigma_mm": self._settings.pose_sigma_mm}
 
     def _stop(self, _body: Json) -> Json:
+        """Brake at once, also in the middle of a move."""
+        device = self._slot.without_waiting()
+        if device is None:
+            raise DeviceAbsentError(str(self._slot.status()["error"]))
         self._enabled = False
-        with self._slot.use() as device:
-            device.quick_stop()
+        device.quick_stop()
         return {}
 
     def _status(self, _body: Json) -> Json:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import logging
-import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +20,9 @@ from echolume_messages.rig import Rig
 from echolume_messages.topics import LEDGER, SCAN_START
 
 DURABLE_S = 5.0
+"""How long the end of a scan waits for the recorder to catch up;"""
+HURRIED_S = 0.5
+"""and when the conductor itself is told to stop."""
 _log = logging.getLogger("echolume.run")
 
 
@@ -34,6 +35,11 @@ class Stage(Protocol):
 
     def advance(self, event: Event, *, prompt: str = "") -> None:
         """Wait while paused, raise `Interrupted` when the scan is to end, else follow the state table."""
+        ...
+
+    @property
+    def hurried(self) -> bool:
+        """Whether the conductor is about to stop."""
         ...
 
     def enter(self, pass_name: str, kind: str) -> None:
@@ -140,19 +146,21 @@ class ScanRun:
 
     def _finish(self, outcome: Outcome) -> None:
         make_safe(self.bus, self.kinds, at_once=False)
-        self._await(lambda: not self.acquisition.ledger.open)
+        patience_s = HURRIED_S if self.stage.hurried else DURABLE_S
+        self.acquisition.settle(patience_s)
         seq = self._publish(outcome, final=True)
-        self._await(lambda: self.acquisition.durable_seq.get(LEDGER.name, -1) >= seq)
+        self._await_ledger(seq, patience_s)
         try:
             self.bus.request("recorder", "close", {"scan": self.scan}, 15.0)
         except EcholumeError as error:
             _log.error("closing the archive of %s: %s", self.scan, error)
         self.stage.happen(Event.CLOSED)
 
-    def _await(self, done: Callable[[], bool]) -> None:
-        """Wait until the recorder has caught up, for at most `DURABLE_S`."""
-        changed: threading.Condition = self.acquisition.changed
-        deadline_s = time.monotonic() + DURABLE_S
-        with changed:
-            while not done() and time.monotonic() < deadline_s:
-                changed.wait(0.05)
+    def _await_ledger(self, seq: int, patience_s: float) -> None:
+        """Wait until the ledger itself is on the disk."""
+        acquisition = self.acquisition
+        with acquisition.changed:
+            if not acquisition.changed.wait_for(
+                lambda: acquisition.durable_seq.get(LEDGER.name, -1) >= seq, patience_s
+            ):
+                _log.warning("scan %s: the recorder has not acknowledged the ledger", self.scan)

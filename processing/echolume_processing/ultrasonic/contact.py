@@ -186,8 +186,11 @@ def contact(
     alone = Contact(EchoKind.NONE, axis_contacts(receivers_mm, paths_mm), up, used, np.inf)
     if np.count_nonzero(used) < MIN_CHANNELS:
         return alone
-    kept = without_slips(receivers_mm, paths_mm, sigma_mm, used)
+    kept = used
     plane = fit_plane(receivers_mm, paths_mm, kept)
+    if plane is None or _chi_squared(paths_mm, plane.paths_mm, sigma_mm, kept) > max_chi_squared:
+        kept = without_slips(receivers_mm, paths_mm, sigma_mm, used)
+        plane = fit_plane(receivers_mm, paths_mm, kept)
     point = fit_point(receivers_mm, paths_mm, kept)
     plane_score = _chi_squared(paths_mm, plane.paths_mm, sigma_mm, kept) if plane is not None else np.inf
     point_score = _chi_squared(paths_mm, point[1], sigma_mm, kept) if point is not None else np.inf

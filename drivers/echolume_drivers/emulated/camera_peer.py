@@ -137,7 +137,7 @@ class CameraPeer:
         self._shots.put(None)
         for thread in self._threads:
             thread.join(timeout=SEND_S + 3)
-        self._drop_host()
+        self._drop_host(self._host)
         self._unlisten()
         self._selector.close()
         self._wake_in.close()
@@ -211,8 +211,8 @@ class CameraPeer:
             pixels = pixels[: pixels.shape[0] // 2]
         messages = self._messages(shot, pixels)
         if name == "truncate":
-            self._send([b"".join(messages[:2])[:-1000]], shot.session)
-            self._order(self._drop_host)
+            host = self._send([b"".join(messages[:2])[:-1000]], shot.session)
+            self._order(lambda: self._drop_host(host))
             return
         if name == "corrupt":
             damaged = bytearray(messages[1])
@@ -229,20 +229,21 @@ class CameraPeer:
         trailer = TRAILER.pack(size, zlib.crc32(payload))
         return [pack(Kind.LEADER, shot.block, leader), *parts, pack(Kind.TRAILER, shot.block, trailer)]
 
-    def _send(self, messages: list[bytes], session: int | None = None) -> None:
-        """Send to the host, if there is one; a host that is gone or takes nothing is let go.
+    def _send(self, messages: list[bytes], session: int | None = None) -> socket.socket | None:
+        """Send to the host, if there is one, and return it; one that is gone or takes nothing is let go.
 
         Frames of an acquisition that was stopped meanwhile (another `session`) are thrown away.
         """
         with self._sending:
             host = self._host
             if host is None or session not in (None, self._session):
-                return
+                return None
             try:
                 for message in messages:
                     host.sendall(message)
             except OSError:
-                self._order(self._drop_host)
+                self._order(lambda: self._drop_host(host))
+            return host
 
     # --- the wire's thread
 
@@ -274,12 +275,14 @@ class CameraPeer:
 
     def _vanish(self) -> None:
         self._unlisten()
-        self._drop_host()
+        self._drop_host(self._host)
 
     def _accept(self) -> None:
         if self._listener is None:
             return
         host, _ = self._listener.accept()
+        if self._host is not None and _hung_up(self._host):
+            self._drop_host(self._host)
         host.settimeout(SEND_S)
         host.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         if self._host is not None:
@@ -294,14 +297,17 @@ class CameraPeer:
             self._host = host
         self._selector.register(host, selectors.EVENT_READ, self._hear)
 
-    def _drop_host(self) -> None:
+    def _drop_host(self, host: socket.socket | None) -> None:
+        """Let go of this host; if another one has taken its place, that one stays."""
+        if host is None or host is not self._host:
+            return
         with self._lock:
             self._acquiring = False
+            self._session += 1
         with self._sending:
-            host, self._host = self._host, None
-        if host is not None:
-            self._selector.unregister(host)
-            host.close()
+            self._host = None
+        self._selector.unregister(host)
+        host.close()
 
     def _hear(self) -> None:
         if self._host is None:
@@ -311,7 +317,7 @@ class CameraPeer:
         except OSError:
             data = b""
         if not data or len(self._line) > LINE_BYTES:
-            self._drop_host()
+            self._drop_host(self._host)
             return
         *lines, self._line = (self._line + data).split(b"\n")
         for line in lines:
@@ -352,6 +358,16 @@ _WRITABLE: dict[str, Callable[[str], bool]] = {
     "TriggerMode": lambda text: text in ("On", "Off"),
     "TriggerSource": lambda text: text in ("Line1", "Software"),
 }
+
+
+def _hung_up(port: socket.socket) -> bool:
+    """Whether the other side is gone and nothing it sent is left to read."""
+    try:
+        return port.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT) == b""
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
 
 
 def _drain(port: socket.socket, limit_s: float = 0.2) -> None:

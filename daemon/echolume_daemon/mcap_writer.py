@@ -174,7 +174,11 @@ class ArchiveWriter:
                 self._file.adopt(chunk)
                 for message in reader.records(chunk):
                     self._count(message, chunk.start)
-        self._file.reopen(scan)
+        if self._file.described:
+            self._file.reopen(scan)
+        else:
+            self.path.unlink()  # cut before its first chunk: nothing in it is worth keeping
+            self._file.create()
 
     def _check(self) -> None:
         if self._failure is not None:

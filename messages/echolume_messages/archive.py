@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,10 +26,12 @@ class ArchiveSummary:
 class ChunkReader:
     """Turns an archive's chunks, fed in file order, into records."""
 
-    def __init__(self, path: Path, wanted: Collection[str] | None = None) -> None:
+    def __init__(
+        self, path: Path, wanted: Collection[str] | None = None, known: Mapping[int, Channel] | None = None
+    ) -> None:
         self._path = path
         self._wanted = wanted
-        self._channels: dict[int, Channel] = {}
+        self._channels = {n: c for n, c in (known or {}).items() if wanted is None or c.topic.name in wanted}
         self._assembler = Assembler()
 
     def raw(self, chunk: mcap_stream.Chunk) -> Iterator[tuple[Channel, mcap_stream.RawMessage]]:

@@ -65,7 +65,7 @@ class Bus:
             Ask the recorder too for what is no longer in the publisher's journal.
         """
         subscription = Subscription(self._session, self.rig, wanted, depth, refill, archive)
-        self._subscriptions.append(subscription)
+        self._subscriptions = [s for s in self._subscriptions if not s.closed] + [subscription]
         return subscription
 
     def serve(self, service: str, handlers: Mapping[str, Handler]) -> None:

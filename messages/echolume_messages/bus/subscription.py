@@ -93,6 +93,11 @@ class Subscription:
         """Why the last rejected record was rejected."""
         return self._last_error
 
+    @property
+    def closed(self) -> bool:
+        """Whether it has been closed."""
+        return self._closing
+
     def close(self) -> None:
         """Stop receiving."""
         with self._changed:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import queue
+import select
 import selectors
 import socket
 import threading
@@ -362,10 +363,12 @@ _WRITABLE: dict[str, Callable[[str], bool]] = {
 
 def _hung_up(port: socket.socket) -> bool:
     """Whether the other side is gone and nothing it sent is left to read."""
-    try:
-        return port.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT) == b""
-    except BlockingIOError:
+    waiting = select.poll()
+    waiting.register(port, select.POLLIN)
+    if not waiting.poll(0):
         return False
+    try:
+        return port.recv(1, socket.MSG_PEEK) == b""
     except OSError:
         return True
 

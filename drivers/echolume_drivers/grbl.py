@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from echolume_drivers.grbl_codes import alarm_words
-from echolume_drivers.grbl_link import KEEP_ALIVE_S, GrblLink
+from echolume_drivers.grbl_link import KEEP_ALIVE_S, CancelledError, GrblLink
 from echolume_messages.errors import DeviceAbsentError, DeviceError, DeviceFaultError, DeviceSilentError
 from echolume_messages.rig import GuideSettings
 
@@ -90,7 +90,7 @@ class GrblGuide:
         with self._turn:
             self._homed = False
             self._program(["$H"], HOMING_S, listening=False)
-            self._link.alarm = None
+            self._link.alarm, self._link.restarted = None, False
             self._homed = True
             return self._look()
 
@@ -135,7 +135,6 @@ class GrblGuide:
 
     def stop(self) -> None:
         """Brake (``!``), wait for standstill, reset: laser off, position kept. Never waits for its turn."""
-        self._link.cancel(DeviceFaultError(f"{self._link.where}: stopped on request"))
         self._link.send(b"!")
         deadline_s = time.monotonic() + MARGIN_S
         state = ""
@@ -188,13 +187,15 @@ class GrblGuide:
         except DeviceAbsentError:
             self._homed = False
             raise
+        except CancelledError:
+            raise  # `stop` has seen to the board
         except DeviceError:
             self._reset()
             raise
 
     def _reset(self) -> None:
         came = self._link.reset(0.5)
-        if not came or self._link.alarm in LOSES_POSITION:
+        if not came or self._link.restarted or self._link.alarm in LOSES_POSITION:
             self._homed = False
 
     def _look(self) -> float:

@@ -30,6 +30,10 @@ KEEP_ALIVE_S: Final = 0.2
 SILENCE_S: Final = 1.0
 
 
+class CancelledError(DeviceFaultError):
+    """The program was taken off the board by somebody else's reset."""
+
+
 @dataclass(frozen=True)
 class Report:
     """One status report ``<...>``."""
@@ -54,7 +58,11 @@ class GrblLink:
         self._banners = 0
         self._report: Report | None = None
         self._work_mm = 0.0
+        self._generation = 0
+        self._expecting_banner = True
         self.alarm: int | None = None
+        self.restarted = False
+        """The board has restarted by itself: its position is lost."""
 
     def _forget(self) -> None:
         self._waiting: deque[str] = deque()
@@ -67,7 +75,7 @@ class GrblLink:
         """Open the port; nobody else can, until it is closed."""
         try:
             opened = serial.serial_for_url(
-                self._port, baudrate=self._baud, timeout=None, write_timeout=1.0, exclusive=True
+                self._port, baudrate=self._baud, timeout=0.2, write_timeout=1.0, exclusive=True
             )
             self._serial = cast(serial.Serial, opened)
         except (serial.SerialException, OSError, ValueError) as error:
@@ -82,8 +90,9 @@ class GrblLink:
         port, self._serial = self._serial, None
         if port is None:
             return
-        with contextlib.suppress(OSError, serial.SerialException):
-            port.cancel_read()
+        if hasattr(port, "cancel_read"):  # sockets have none; their reads end by time
+            with contextlib.suppress(OSError, serial.SerialException):
+                port.cancel_read()
         if self._reader is not None:
             self._reader.join(2.0)
         port.close()
@@ -101,6 +110,8 @@ class GrblLink:
             try:
                 data = port.read(1)
                 data += port.read(port.in_waiting) if data else b""
+                if not data:
+                    continue
             except (serial.SerialException, OSError, TypeError) as error:
                 if self._serial is port:
                     self._fail(DeviceAbsentError(f"{self.where}: the port died: {error}. Check the cable and power."))
@@ -132,7 +143,8 @@ class GrblLink:
             self._take_report(line[1:-1])
         elif line.startswith("Grbl "):
             self._banners += 1
-            if self._waiting:
+            if not self._expecting_banner:
+                self.restarted = True
                 self._fail(DeviceFaultError(f"{self.where}: the controller restarted by itself; home again"))
         elif line.startswith(("[", "$")):
             self._answers.append(line)
@@ -176,7 +188,7 @@ class GrblLink:
             Without their ends; together they must fit the receive buffer, so that the board either has the whole
             program or has not begun it.
         timeout_s
-            For all of them. A status query each 0.2 s keeps the dead-man relay closed meanwhile.
+            For all of them. A status query each 0.2 s keeps the dead-man relay closed while the board answers it.
         listening
             False while homing: the board answers no status query then.
 
@@ -191,37 +203,40 @@ class GrblLink:
         with self._turn:
             with self._news:
                 self._raise_trouble()
+                generation = self._generation
                 self._waiting.extend(lines)
                 self._answers = []
             self.send(data)
-            self._wait_acknowledged(timeout_s, listening)
+            self._wait_acknowledged(timeout_s, listening, generation)
             with self._news:
                 return self._answers
 
-    def _wait_acknowledged(self, timeout_s: float, listening: bool) -> None:
-        begin_s = heard_s = time.monotonic()
-        asked_s = begin_s
+    def _wait_acknowledged(self, timeout_s: float, listening: bool, generation: int) -> None:
+        begin_s = heard_s = asked_s = time.monotonic()
         seen = self._report
-        while True:
-            with self._news:
-                self._raise_trouble()
-                if not self._waiting:
-                    return
-                self._news.wait(KEEP_ALIVE_S / 4)
-                self._raise_trouble()
-                if not self._waiting:
-                    return
-                pending = self._waiting[0]
-                if self._report is not seen:
-                    seen, heard_s = self._report, time.monotonic()
+        while (pending := self._unacknowledged(generation)) is not None:
+            if self._report is not seen:
+                seen, heard_s = self._report, time.monotonic()
             now_s = time.monotonic()
             if now_s - begin_s > timeout_s:
                 raise DeviceSilentError(f"{self.where}: no ok for {pending!r} within {timeout_s:.1f} s")
             if listening and asked_s > heard_s and now_s - heard_s > SILENCE_S:
                 raise DeviceSilentError(f"{self.where}: no status report for {SILENCE_S:.1f} s; the controller hangs")
-            if now_s - asked_s >= KEEP_ALIVE_S:
-                asked_s = now_s
+            if listening and heard_s >= asked_s and now_s - asked_s >= KEEP_ALIVE_S:
+                asked_s = now_s  # only a board that answered is kept alive: else the relay must open
                 self.send(b"?")
+
+    def _unacknowledged(self, generation: int) -> str | None:
+        """Wait a moment for news; the line that waits for its ok, or None when all have theirs."""
+        with self._news:
+            self._news.wait_for(
+                lambda: self._trouble is not None or not self._waiting or self._generation != generation,
+                KEEP_ALIVE_S / 4,
+            )
+            if self._generation != generation:
+                raise CancelledError(f"{self.where}: stopped on request")
+            self._raise_trouble()
+            return self._waiting[0] if self._waiting else None
 
     def _raise_trouble(self) -> None:
         if self._trouble is not None:
@@ -245,7 +260,10 @@ class GrblLink:
         """Send 0x18 and forget what was under way; whether the banner came."""
         with self._news:
             banners = self._banners
+            self._generation += 1
+            self._expecting_banner = True
             self._waiting.clear()
+            self._news.notify_all()
         self.send(b"\x18")
         return self.await_banner(banners, timeout_s)
 
@@ -254,16 +272,10 @@ class GrblLink:
         came = self._wait(lambda: self._banners > since, timeout_s)
         if came:
             with self._news:
+                self._expecting_banner = False
                 if not isinstance(self._trouble, DeviceAbsentError):
                     self._forget()
         return came
-
-    def cancel(self, error: DeviceError) -> None:
-        """Make whoever waits for an acknowledgement give up with `error`."""
-        with self._news:
-            if self._waiting:
-                self._trouble = self._trouble or error
-                self._news.notify_all()
 
 
 def _number(line: str) -> int:

@@ -21,6 +21,7 @@ SOFT_HALF_MM: Final = 155.0
 """Travel that the controller allows, to either side of the guide's middle."""
 SWITCH_MM: Final = 156.0
 """Where the limit switches are, to either side of the guide's middle."""
+LOST_MM: Final = 0.2
 BANNER: Final = "\r\nGrbl 1.1h ['$' for help]"
 UNLOCK: Final = "[MSG:'$H'|'$X' to unlock]"
 
@@ -90,7 +91,7 @@ class GrblMachine:
             hit_s = self._limit_hit_s(now_s)
             if hit_s is None or now_s < hit_s:
                 return []
-            return self._crash(1, now_s)
+            return self._crash(1, hit_s)
 
     def _limit_hit_s(self, now_s: float) -> float | None:
         if not self.settings[21] or self._homing:
@@ -111,15 +112,17 @@ class GrblMachine:
             return self._crash(code, time.monotonic())
 
     def _crash(self, code: int, now_s: float) -> list[str]:
-        here_mm = self.planner.position_mm(now_s)
-        self.planner.stand(here_mm)
+        self._stand(now_s, lost_mm=LOST_MM if code == 1 else 0.0)
         self._held, self._locked, self.alarm = None, True, code
         self._spindle, self._power = 5, 0.0
         self._critical = code in (1, 2)
-        if code != 2:
-            self._offset_mm += 0.2 if code == 1 else 0.0
         self._wipe()
         return [f"ALARM:{code}", "[MSG:Reset to continue]" if self._critical else UNLOCK]
+
+    def _stand(self, now_s: float, lost_mm: float) -> None:
+        """Cut the motion; a motor stopped at speed loses steps, so the board's count is off by `lost_mm`."""
+        self.planner.stand(self.planner.position_mm(now_s) - lost_mm)
+        self._offset_mm += lost_mm
 
     def _wipe(self) -> None:
         self._generation += 1
@@ -149,14 +152,15 @@ class GrblMachine:
         with self.changed:
             now_s = time.monotonic()
             said: list[str] = []
+            lost_mm = 0.0
             if self._homing:
                 self.alarm, self._locked = 6, True
                 said = ["ALARM:6"]
             elif self.planner.running(now_s) is not None:
                 self.alarm, self._locked = 3, True
-                self._offset_mm += 0.2
+                lost_mm = LOST_MM
                 said = ["ALARM:3"]
-            self.planner.stand(self.planner.position_mm(now_s))
+            self._stand(now_s, lost_mm)
             self._homing = self._critical = self._jogging = False
             self._held = None
             self._modal()

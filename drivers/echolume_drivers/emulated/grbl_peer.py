@@ -1,8 +1,9 @@
 """An emulated Grbl board behind a PTY: the guide's motor and the laser-enable line of the emulated rig.
 
 Opening the port restarts the board after a moment, as DTR does to an Uno. The laser-enable output of the board goes
-through a relay of its own (the dead-man) that opens when no byte has arrived for 500 ms; ``bare=True`` leaves it
-out and shows the danger. Deadlines of the relay are real time whatever the stage's speed.
+through a relay of its own (the dead-man) that opens when no byte has arrived for 500 ms and stays open until the
+board's output has gone low; ``bare=True`` leaves it out and shows the danger. Deadlines of the relay are real time
+whatever the stage's speed.
 
 Faults for `GrblPeer.inject`: ``drop_ok``, ``duplicate_ok``, ``late_ok`` (``delay_s``), ``garbage``, ``half_line``
 (each for the next ``ok``; ``count`` for more), ``reset`` (restart now), ``alarm`` (``code``; 6 and 9 strike at the
@@ -57,7 +58,7 @@ class GrblPeer:
         self._laser = threading.RLock()
         self._faults: dict[str, list[float]] = {name: [] for name in _REPLY_FAULTS}
         self._last_byte_s = 0.0
-        self._hung = False
+        self._hung = self._tripped = False
         self._stopping = False
         self._threads = [
             threading.Thread(target=self._listen, name="grbl-port", daemon=True),
@@ -257,8 +258,12 @@ class GrblPeer:
     def _refresh(self) -> None:
         with self._laser:
             now_s = time.monotonic()
-            closed = self._bare or now_s < self._last_byte_s + RELAY_S
-            self._stage.switch_laser(closed and self.machine.laser_demand(now_s))
+            demand = self.machine.laser_demand(now_s)
+            if not demand:
+                self._tripped = False
+            elif not self._bare and now_s >= self._last_byte_s + RELAY_S:
+                self._tripped = True
+            self._stage.switch_laser(demand and not self._tripped)
 
 
 def _wire(lines: list[str]) -> bytes:

@@ -11,7 +11,7 @@ from typing import TypeAlias, cast
 
 from echolume_daemon.ledger import Expected, Ledger
 from echolume_messages.bus import Bus
-from echolume_messages.errors import DeviceAbsentError, EcholumeError, NoReplyError, ScanError
+from echolume_messages.errors import ArchiveError, DeviceAbsentError, EcholumeError, NoReplyError, ScanError
 from echolume_messages.plan import Step
 from echolume_messages.rig import Rig
 from echolume_messages.topics import CAMERA_LEFT, CAMERA_RIGHT, ECHOES, PASS_STREAMS
@@ -47,12 +47,16 @@ class Acquisition:
     calibration: str
     ledger: Ledger
     gate: Callable[[], None]
+    reopen: Callable[[], None] = lambda: None
+    """Has the recorder open the archive again, after it was restarted."""
     changed: threading.Condition = field(default_factory=threading.Condition)
     durable_seq: dict[str, int] = field(default_factory=dict[str, int])
     _fired_s: dict[tuple[int, int], float] = field(default_factory=dict[tuple[int, int], float])
     _errors: int = 0
     _revoked: set[Expected] = field(default_factory=set[Expected])
     _next_ask_s: float = 0.0
+    _next_look_s: float = 0.0
+    _recorder_error: str = ""
 
     # -- what the recorder says
 
@@ -61,6 +65,7 @@ class Acquisition:
         if message.get("scan") != self.scan:
             return
         with self.changed:
+            self._recorder_error = str(message.get("error") or "") or self._recorder_error
             self.durable_seq.update(cast("dict[str, int]", message.get("durable", {})))
             for topic, trigger, attempt, _seq in cast("list[tuple[str, int, int, int]]", message.get("records", [])):
                 self.ledger.durable(topic, trigger, attempt)
@@ -113,6 +118,8 @@ class Acquisition:
         """Acquire steps; each failure only loses its own trigger, unless the device stays away."""
         for step in steps:
             self.gate()
+            if self._recorder_error:
+                self.watch_recorder()
             self._await_room(step)
             self._attempt(step)
 
@@ -124,6 +131,7 @@ class Acquisition:
         while left := [e for e in self._open() if e.trigger in names]:
             self.gate()
             self._ask_for_missing()
+            self.watch_recorder()
             if len(left) != before:
                 before, deadline_s = len(left), time.monotonic() + DRAIN_S
             elif time.monotonic() > deadline_s:
@@ -134,6 +142,28 @@ class Acquisition:
         self._ask_for_missing(at_once=True)
         with self.changed:
             return self.ledger.missing(pass_name)
+
+    def watch_recorder(self) -> None:
+        """Fail as soon as the recorder's disk does; have a restarted recorder go on with the archive.
+
+        Raises
+        ------
+        ArchiveError
+            What the recorder says of its disk.
+        """
+        if self._recorder_error:
+            raise ArchiveError(f"recorder: {self._recorder_error}")
+        now_s = time.monotonic()
+        if now_s < self._next_look_s:
+            return
+        self._next_look_s = now_s + 1.0
+        try:
+            archives = cast("Json", self._ask("recorder", "status", {}, 2.0).get("archives", {}))
+            if self.scan not in archives:
+                _log.warning("the recorder was restarted; it goes on with the archive of %s", self.scan)
+                self.reopen()
+        except NoReplyError as error:
+            _log.warning("recorder: %s", error)
 
     def settle(self, timeout_s: float) -> None:
         """Wait until nothing is under way any more; what is left then stays open."""
@@ -213,6 +243,7 @@ class Acquisition:
             if held + needed <= limit and age_s <= HELD_SHARE * self.rig.bus.journal_s:
                 return
             self._ask_for_missing()
+            self.watch_recorder()
             if now_s > deadline_s:
                 raise ScanError(
                     f"recorder: acknowledged nothing of {_named(waiting)} for {HELD_LIMIT_S:.0f} s; is it running, "

@@ -17,10 +17,11 @@ from echolume_daemon.ledger import Ledger
 from echolume_daemon.run import ScanRun
 from echolume_daemon.service import Json, Loop, Service, run_service
 from echolume_daemon.states import Event, RunState, follow
+from echolume_messages import archive
 from echolume_messages import calibration as calibration_file
 from echolume_messages import plan as plan_file
 from echolume_messages.bus import Bus
-from echolume_messages.errors import ConfigError, EcholumeError, WrongStateError
+from echolume_messages.errors import ArchiveError, ConfigError, EcholumeError, WrongStateError
 from echolume_messages.rig import Rig
 from echolume_messages.topics import DURABLE, RUN_STATE
 
@@ -137,19 +138,30 @@ class Conductor:
             self._run = None
             self.happen(Event.REFUSED if self._state is RunState.ARMING else Event.CLOSED, error=why)
 
-    def _arm(self, plan: plan_file.Plan, archive: str, calibration: Json | None, digest: str) -> ScanRun:
+    def _arm(self, plan: plan_file.Plan, path: str, calibration: Json | None, digest: str) -> ScanRun:
         bus, rig = self._service.bus, self._service.rig
-        if archive and not Path(archive).is_absolute():
-            raise ConfigError(f"$.archive: expected an absolute path, got {archive!r}")
-        scan = f"{plan.name}-{time.strftime('%Y%m%dT%H%M%S', time.gmtime())}-{secrets.token_hex(2)}"
-        ledger = Ledger(plan_file.expand(plan))
+        if path and not Path(path).is_absolute():
+            raise ConfigError(f"$.archive: expected an absolute path, got {path!r}")
+        scan, ledger = self._ledger_of(plan, path, calibration)
         acquisition = Acquisition(bus, rig, scan, digest, ledger, self.gate)
-        run = ScanRun(bus, rig, scan, plan, archive, calibration, acquisition, self, self._keep_ledger)
+        run = ScanRun(bus, rig, scan, plan, path, calibration, acquisition, self, self._keep_ledger)
         acquisition.check(run.kinds)
         with self._changed:
             self._run = run
         run.open_archive()
         return run
+
+    def _ledger_of(self, plan: plan_file.Plan, path: str, calibration: Json | None) -> tuple[str, Ledger]:
+        """A new scan, or the one that an unfinished archive of the same plan and calibration was left behind by."""
+        if path and Path(path).exists() and archive.summary(Path(path)).torn:
+            ledger, start = Ledger.from_archive(Path(path))
+            if start.plan != plan or start.calibration != calibration:
+                raise ArchiveError(f"{path}: is of another plan or calibration; choose another file for this scan")
+            _, _, matched = ledger.count()
+            self._service.log.info("scan %s goes on in %s: %d matched so far", start.scan, path, matched)
+            return start.scan, ledger
+        scan = f"{plan.name}-{time.strftime('%Y%m%dT%H%M%S', time.gmtime())}-{secrets.token_hex(2)}"
+        return scan, Ledger(plan_file.expand(plan))
 
     def _calibration(self, given: object) -> tuple[Json | None, str]:
         """The scan's calibration, checked to be of this rig, and its digest."""

@@ -54,6 +54,7 @@ class GuideService:
         self._service, self._settings = service, service.rig.guide
         self._homed = False
         self._alive: set[str] = set()
+        self._darkening = threading.Lock()
         self._gone: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._slot = Slot("guide", lambda: device or _driver(self._settings), self._prepare, lambda d: d.status())
         self._slot.watch(service)
@@ -100,11 +101,10 @@ class GuideService:
 
     def _dark(self, why: str) -> None:
         """Laser off, even while an exposure or a move is under way."""
-        device = self._slot.without_waiting()
-        if device is None:
+        if not self._slot.present:
             return
         try:
-            device.laser_off()
+            self._laser_off({})
         except DeviceError as error:
             self._service.log.error("laser off (%s) failed: %s; use the emergency stop", why, error)
         else:
@@ -142,11 +142,14 @@ class GuideService:
         return {"x_mm": x_mm, "sigma_mm": self._settings.position_sigma_mm, "method": "step"}
 
     def _laser_off(self, _body: Json) -> Json:
-        self._at_once().laser_off()
+        """Also in the middle of an exposure; one at a time, for they would take each other for a stop."""
+        with self._darkening:
+            self._at_once().laser_off()
         return {}
 
     def _stop(self, _body: Json) -> Json:
-        self._at_once().stop()
+        with self._darkening:
+            self._at_once().stop()
         return {}
 
     def _status(self, _body: Json) -> Json:

@@ -30,10 +30,12 @@ class Expected(NamedTuple):
     attempt: int
 
 
-class _Start(msgspec.Struct):
-    """What the ledger needs of ``conductor/start``."""
+class ScanStart(msgspec.Struct):
+    """What going on with a scan needs of its ``conductor/start``."""
 
+    scan: str
     plan: Plan
+    calibration: dict[str, object] | None = None
 
 
 @dataclass
@@ -57,33 +59,35 @@ class Ledger:
         self._steps = {step.trigger: step for step in self.steps}
 
     @classmethod
-    def from_archive(cls, path: Path) -> tuple[Ledger, Plan]:
+    def from_archive(cls, path: Path) -> tuple[Ledger, ScanStart]:
         """Rebuild the ledger from what an archive holds, e.g. after a crash.
 
         Returns
         -------
         tuple
-            The ledger, in which every record found counts as fired and durable, and the plan of the scan.
+            The ledger, in which every record found counts as fired and durable, and how the scan was started.
 
         Raises
         ------
         ArchiveError
             It is no archive, or the start of its scan is not in it.
         """
-        plan: Plan | None = None
+        start: ScanStart | None = None
         records: list[Expected] = []
         for message in archive.read(path, topics={SCAN_START.name, *RAW_STREAMS}):
             if message.topic.name == SCAN_START.name:
-                plan = msgspec.convert(message.json(), _Start).plan
+                start = msgspec.convert(message.json(), ScanStart)
             else:
                 records.append(Expected(message.header.stream, message.header.trigger, message.header.attempt))
-        if plan is None:
+        if start is None:
             raise ArchiveError(f"{path}: holds no start of a scan, so its plan is unknown; start the scan anew")
-        ledger = cls(expand(plan))
+        ledger = cls(expand(start.plan))
         for record in records:
             ledger.fired(record.trigger, record.attempt)
             ledger.durable(*record)
-        return ledger, plan
+        for record in ledger.open:
+            ledger.lost(*record)
+        return ledger, start
 
     def fired(self, trigger: int, attempt: int) -> None:
         """A trigger is about to be fired: its records are expected from now on."""

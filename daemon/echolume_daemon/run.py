@@ -62,6 +62,7 @@ class ScanRun:
     on_ledger: Callable[[Json], None]
 
     def __post_init__(self) -> None:
+        self.acquisition.reopen = self.open_archive
         self._ledgers: Publisher = self.bus.publisher(LEDGER)
         self._starts: Publisher = self.bus.publisher(SCAN_START)
         self.kinds = list(dict.fromkeys(step.kind for step in self.acquisition.ledger.steps))

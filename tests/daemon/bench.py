@@ -259,7 +259,7 @@ class FakeRecorder:
         self._inbox = bus.subscribe([CAMERA_LEFT, CAMERA_RIGHT, ECHOES, LEDGER, SCAN_START], depth=256)
         self._durable = bus.publisher(DURABLE)
         self._stop = threading.Event()
-        bus.serve("recorder", {"open": self._open, "close": self._close, "status": lambda _b: {"scan": self.scan}})
+        bus.serve("recorder", {"open": self._open, "close": self._close, "status": lambda _b: {"archives": {self.scan: {}}}})
         bus.declare_alive("recorder")
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()

@@ -80,7 +80,8 @@ def test_a_dropped_frame_is_named_and_acquired_again(bench: Bench) -> None:
     assert bench.recorder.frames["cameras/right", 3, 0][0, 0] == 4
 
 
-def test_what_stays_missing_is_named(bench: Bench) -> None:
+def test_what_stays_missing_is_named(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("echolume_daemon.acquisition.DRAIN_S", 0.5)
     bench.recorder.deaf = {("array/echoes", 2, attempt) for attempt in range(3)}
     bench.start("robot", "array", "conductor")
     client = ScanClient(bench.bus, "ann@lab")

@@ -13,12 +13,13 @@ import msgspec
 import numpy as np
 
 from echolume_drivers.emulated.array_peer import ArrayPeer
-from echolume_drivers.emulated.array_truth import array_truth
+from echolume_drivers.emulated.array_truth import ArrayTruth, array_truth
 from echolume_drivers.emulated.board_image import board_at, board_poses, render_board
 from echolume_drivers.emulated.camera_peer import CameraPeer
 from echolume_drivers.emulated.control import ADDRESS_FILE, ControlServer, Json
+from echolume_drivers.emulated.echoes import simulate_ping
 from echolume_drivers.emulated.grbl_peer import GrblPeer
-from echolume_drivers.emulated.optics import optical_truth
+from echolume_drivers.emulated.optics import OpticalTruth, Side, optical_truth
 from echolume_drivers.emulated.robot_peer import RobotPeer
 from echolume_drivers.emulated.scene import SCENES
 from echolume_drivers.emulated.stage import Stage
@@ -96,6 +97,8 @@ class EmulatedRig:
         self._array_settings = ArraySettings(port="", pulse=pulse)
         self._bare = bare
         self._rig: Rig | None = None
+        self.cameras: dict[Side, CameraPeer] = {}
+        """Both cameras by side, after `start`; for tests."""
         self._opened = contextlib.ExitStack()
         self._quit = threading.Event()
 
@@ -140,13 +143,14 @@ class EmulatedRig:
             raise
 
     def _start_devices(self) -> None:
-        _warm_up(self._stage)
+        sound = array_truth(self._seed, self._array_settings)
+        _warm_up(self._stage, self._truth, self._array_settings, sound)
         guide = self._begin(GrblPeer(self._stage, bare=self._bare))
         robot = self._begin(RobotPeer(self._stage))
         left = self._begin(CameraPeer(self._stage, "left", self._truth))
         right = self._begin(CameraPeer(self._stage, "right", self._truth))
         trigger = self._begin(TriggerPeer(self._stage, [left, right]))
-        array = self._begin(ArrayPeer(self._stage, self._array_settings, array_truth(self._seed, self._array_settings)))
+        array = self._begin(ArrayPeer(self._stage, self._array_settings, sound))
         self._devices = {
             "guide": guide.inject,
             "robot": robot.inject,
@@ -155,7 +159,7 @@ class EmulatedRig:
             "trigger": trigger.inject,
             "array": array.inject,
         }
-        self._cameras = (left, right)
+        self.cameras = {"left": left, "right": right}
         self._control = ControlServer(
             {
                 "place": self._place,
@@ -210,7 +214,7 @@ class EmulatedRig:
                 if name not in SCENES:
                     raise ValueError(f"unknown scene {name!r}; known: {', '.join(SCENES)}")
                 self._stage.place(scene=SCENES[name]())
-            case {"board": int(index)}:
+            case {"board": int(index)} if not isinstance(index, bool):
                 if not 0 <= index < len(self._poses):
                     raise ValueError(f"board pose {index} is not among 0..{len(self._poses) - 1}")
                 self._stage.place(board=board_at(self._poses[index]))
@@ -254,7 +258,7 @@ class EmulatedRig:
                 "robot_pose": [float(v) for v in self._stage.robot_pose()],
                 "scene": self._stage.scene.name,
                 "board": None if board is None else board.rig_from_board.tolist(),
-                "missed": [camera.missed for camera in self._cameras],
+                "missed": [camera.missed for camera in self.cameras.values()],
                 "seed": self._stage.seed,
                 "speed": self._stage.speed,
             }
@@ -290,10 +294,14 @@ def _free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def _warm_up(stage: Stage) -> None:
-    """Compile the renderers before the first trigger needs them."""
-    truth, rng = optical_truth(stage.seed), np.random.default_rng(0)
+def _warm_up(stage: Stage, optics: OpticalTruth, array: ArraySettings, sound: ArrayTruth) -> None:
+    """Compile the forward models and trace the cameras' rays before the first trigger needs them."""
+    rng = np.random.default_rng(0)
     board = board_at(np.eye(4))
-    for laser_on in (True, False):
-        render_stripe(stage.scene, truth, "left", 0.0, rng, 1e-3, laser_on)
-        render_board(board, truth, "left", 0.0, rng, 1e-3, laser_on)
+    sides: tuple[Side, Side] = ("left", "right")
+    for side in sides:
+        for laser_on in (True, False):
+            render_stripe(stage.scene, optics, side, 0.0, rng, 1e-3, laser_on)
+            render_board(board, optics, side, 0.0, rng, 1e-3, laser_on)
+    pose = np.array([0.0, 0.0, 150.0, 0.0, 0.0, 0.0])
+    simulate_ping(stage.scene, sound.rig_from_array(pose), array, sound, stage.air_temperature_c, rng)

@@ -136,6 +136,11 @@ class Gate:
     samples: int
     window: NDArray[np.float32]
 
+    @property
+    def thinning(self) -> int:
+        """Every how many bins are enough for what lies within the gate."""
+        return max(1, self.samples // (self.last - self.first))
+
     def waveform(self, spectrum: NDArray[np.complex64]) -> NDArray[np.complex64]:
         """Gated complex waveform (..., last - first) of band spectra (..., bins)."""
         padded = np.zeros((*spectrum.shape[:-1], self.samples), dtype=np.complex64)

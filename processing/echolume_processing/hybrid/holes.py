@@ -1,4 +1,4 @@
-"""Where light returned nothing: which holes are shadows, which are surfaces that swallow light, and what closes them."""
+"""Where light returned nothing: shadows, surfaces that swallow light, and what closes the holes for prediction."""
 
 from __future__ import annotations
 

@@ -13,9 +13,9 @@ from scipy.spatial import cKDTree
 from echolume_messages.plan import MapField
 from echolume_processing.hybrid.grid import cell_index
 from echolume_processing.hybrid.model import cell_centres_mm
-from echolume_processing.hybrid.plates import Plane, fit_plane, ping_heights
+from echolume_processing.hybrid.plates import PingHeights, Plane, fit_plane, ping_heights
 from echolume_processing.hybrid.sounding import Sounding, Spectra
-from echolume_processing.hybrid.surface import Surface, surface
+from echolume_processing.hybrid.surface import Surface, reshaped
 from echolume_processing.hybrid.tiles import Mask, covered, occupancy, tiles_over
 
 INSIDE_MM = 5.0
@@ -24,11 +24,16 @@ LIKENESS = 0.5
 LEAST_PINGS = 3
 JUDGED_MM = 30.0
 """Pings whose foot is this near to a region judge it."""
+NOTICED_MM = 50.0
+"""Pings further than this from a change hardly notice it."""
+JUDGES = 80
+"""So many judges are enough to accept or refuse a plate."""
 STEP_MM = 0.3
 """Step of the parabola through three heights."""
 ACCEPTED = 0.6
 """A plate must bring the residual energy below this share of what it was."""
 TILT_GAIN = 0.95
+LEAST_SLOPE = 0.01
 LEAST_MM2 = 150.0
 LEAST_RISE_MM = 1.5
 NEIGHBOUR_MM = 12.0
@@ -65,8 +70,8 @@ class State:
 
     def with_height(self, height_mm: NDArray[np.float64], changed: Mask) -> State:
         """The state after some cells got another height; only the pings that can notice are predicted anew."""
-        scene = surface(height_mm, self.scene.field)
-        which = pings_near(self.found, changed, self.scene.field, 2.5 * JUDGED_MM)
+        scene = reshaped(self.scene, height_mm)
+        which = pings_near(self.found, changed, self.scene.field, NOTICED_MM)
         predicted = self.predicted.copy()
         if which.size:
             predicted[which] = self.found.predict(scene, which)
@@ -99,7 +104,7 @@ def absorbing(state: State, hole: Mask) -> Patch | None:
     if np.median(heights.likeness) < LIKENESS:
         return None
     planes = [fit_plane(found, heights, tilted) for tilted in (False, True)]
-    return _settle(state, hole, planes, over)
+    return _settle(state, hole, planes, heights)
 
 
 def transparent(state: State, cluster: NDArray[np.int64]) -> Patch | None:
@@ -115,25 +120,27 @@ def transparent(state: State, cluster: NDArray[np.int64]) -> Patch | None:
     found, field = state.found, state.scene.field
     window = _around(found, cluster, field)
     judges = pings_near(found, window, field, JUDGED_MM)
-    before = _residual(found, state.predicted[judges], judges)
     heights = ping_heights(found, cluster)
+    jury = judges[:: max(1, judges.size // JUDGES)]
+    before = _residual(found, state.predicted[jury], jury)
     best: Patch | None = None
     best_after = ACCEPTED * before
     for tilted in (False, True):
-        if tilted and cluster.size < 2 * LEAST_PINGS:
-            continue
         plane = fit_plane(found, heights, tilted)
+        if tilted and np.hypot(plane.slope_x, plane.slope_y) < LEAST_SLOPE:
+            continue
         mask = _extent(state, window, judges, plane)
         if mask.sum() * field.cell_mm**2 < LEAST_MM2:
             continue
-        inside = pings_inside(found, mask, field, 0.0)
-        if inside.size < LEAST_PINGS:
+        inside = np.isin(heights.which, pings_inside(found, mask, field, 0.0))
+        if inside.sum() < LEAST_PINGS:
             continue
-        patch = _settle(state, mask, [plane], inside)
+        over = PingHeights(heights.which[inside], heights.height_mm[inside], heights.likeness[inside])
+        patch = _settle(state, mask, [plane], over)
         rise_mm = float(np.median((patch.plane.image(field) - state.scene.height_mm)[mask]))
         if rise_mm < LEAST_RISE_MM:
             continue
-        after = _residual(found, _predict(state, mask, patch.plane, judges), judges)
+        after = _residual(found, found.predict(_with_patch(state.scene, mask, patch.plane), jury), jury)
         if after < best_after:
             best, best_after = patch, TILT_GAIN * after
     return best
@@ -180,9 +187,8 @@ def _extent(state: State, window: Mask, judges: NDArray[np.int64], plane: Plane)
     return labels == int(sizes.argmax())
 
 
-def _predict(state: State, mask: Mask, plane: Plane, which: NDArray[np.int64]) -> Spectra:
-    height_mm = np.where(mask, plane.image(state.scene.field), state.scene.height_mm)
-    return state.found.predict(surface(height_mm, state.scene.field), which)
+def _with_patch(scene: Surface, mask: Mask, plane: Plane) -> Surface:
+    return reshaped(scene, np.where(mask, plane.image(scene.field), scene.height_mm))
 
 
 def _residual(found: Sounding, predicted: Spectra, which: NDArray[np.int64]) -> float:
@@ -191,12 +197,13 @@ def _residual(found: Sounding, predicted: Spectra, which: NDArray[np.int64]) -> 
     return float((found.residual(predicted, which) * energy).sum() / energy.sum())
 
 
-def _settle(state: State, mask: Mask, planes: list[Plane], over: NDArray[np.int64]) -> Patch:
+def _settle(state: State, mask: Mask, planes: list[Plane], over: PingHeights) -> Patch:
     """Choose a plane and refine its height on the pings right over it."""
-    judges = over[:: max(1, over.size // 16)]
+    judges = over.which[:: max(1, over.which.size // 16)]
+    near = _with_patch(state.scene, mask, planes[0])
 
     def cost(plane: Plane) -> float:
-        return _residual(state.found, _predict(state, mask, plane, judges), judges)
+        return _residual(state.found, state.found.predict(_with_patch(near, mask, plane), judges), judges)
 
     costs = [cost(p) for p in planes]
     best = 1 if len(planes) > 1 and costs[1] < TILT_GAIN * costs[0] else 0
@@ -208,7 +215,7 @@ def _settle(state: State, mask: Mask, planes: list[Plane], over: NDArray[np.int6
     plane, level = _parabola(plane, level, cost)
     rivals = [cost(plane.raised(s * half_wave_mm)) for s in (-1, 1)] if narrow else []
     spread_mm = _spread(state.found, plane, over)
-    return Patch(mask, plane, spread_mm, int(over.size), any(r < RIVAL * level for r in rivals))
+    return Patch(mask, plane, spread_mm, int(over.which.size), any(r < RIVAL * level for r in rivals))
 
 
 def _slip(plane: Plane, level: float, half_wave_mm: float, cost: Callable[[Plane], float]) -> tuple[Plane, float]:
@@ -229,10 +236,8 @@ def _parabola(plane: Plane, level: float, cost: Callable[[Plane], float]) -> tup
     return plane.raised(shift_mm), level - 0.125 * (below - above) ** 2 / bend
 
 
-def _spread(found: Sounding, plane: Plane, over: NDArray[np.int64]) -> float:
+def _spread(found: Sounding, plane: Plane, over: PingHeights) -> float:
     """Standard deviation of a plane's height: robust spread of its pings' own heights over the root of their number."""
-    heights = ping_heights(found, over)
-    centre = np.array([found.apertures[int(k)].elements_mm[0] for k in over])
-    expected = plane.at(centre[:, 0], centre[:, 1])
-    spread_mm = 1.4826 * float(np.median(np.abs(heights.height_mm - expected)))
-    return max(0.05, spread_mm / float(np.sqrt(over.size)))
+    centre = np.array([found.apertures[int(k)].elements_mm[0] for k in over.which])
+    spread_mm = 1.4826 * float(np.median(np.abs(over.height_mm - plane.at(centre[:, 0], centre[:, 1]))))
+    return max(0.05, spread_mm / float(np.sqrt(over.which.size)))

@@ -60,7 +60,7 @@ def ping_heights(found: Sounding, which: NDArray[np.int64]) -> PingHeights:
     the same ambiguity, and only the whole waveform model can judge it.
     """
     heights_mm = np.arange(LOWEST_MM, CEILING_MM, HEIGHT_STEP_MM)
-    measured = found.gate.spectrum(found.measured[which])
+    measured = found.gate.spectrum(found.measured[which])[..., :: found.gate.thinning]
     best_mm, like = np.empty(which.size), np.empty(which.size)
     for n, k in enumerate(which):
         plates = _plate_spectra(found, found.apertures[int(k)], heights_mm)
@@ -78,9 +78,10 @@ def _plate_spectra(found: Sounding, where: Aperture, heights_mm: NDArray[np.floa
     image[:, 2] = 2 * heights_mm - emitter[2]
     ray = receivers[None, :, :] - image[:, None, :]
     path_mm = np.linalg.norm(ray, axis=2)  # (heights, receivers)
-    wave = 2 * np.pi * found.band.frequency_hz / (found.speed_mps * 1e3)
+    thin = slice(None, None, found.gate.thinning)
+    wave = 2 * np.pi * found.band.frequency_hz[thin] / (found.speed_mps * 1e3)
     spectra = np.exp(-1j * path_mm[..., None] * wave).astype(np.complex64) / path_mm[..., None].astype(np.float32)
-    return spectra * (found.channels.response * found.channels.filter)
+    return spectra * (found.channels.response * found.channels.filter)[:, thin]
 
 
 def fit_plane(found: Sounding, heights: PingHeights, tilted: bool) -> Plane:

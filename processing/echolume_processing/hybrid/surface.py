@@ -11,9 +11,9 @@ from scipy import ndimage
 
 from echolume_messages.plan import MapField
 
-AZIMUTHS = 32
+AZIMUTHS = 24
 """Directions in which the horizon of a facet is known."""
-HORIZON_MM = 60.0
+HORIZON_MM = 50.0
 WALL_MM = 2.0
 """A rise of more than this between two neighbouring cells is a wall, not a slope."""
 
@@ -43,14 +43,40 @@ def surface(height_mm: NDArray[np.float64], field: MapField) -> Surface:
     if height_mm.shape != field.shape or not np.isfinite(height_mm).all():
         raise ValueError(f"height_mm: expected finite heights of shape {field.shape}, got {height_mm.shape}")
     height_mm = np.ascontiguousarray(height_mm, dtype=np.float64)
-    reach = round(HORIZON_MM / field.cell_mm)
+    every = (0, height_mm.shape[0], 0, height_mm.shape[1])
+    horizon = np.zeros((*height_mm.shape, AZIMUTHS), dtype=np.float32)
+    _renew_horizons(horizon, height_mm, field.cell_mm, every)
+    return Surface(field, height_mm, slopes(height_mm, field.cell_mm), horizon, _walls(height_mm, field))
+
+
+def reshaped(scene: Surface, height_mm: NDArray[np.float64]) -> Surface:
+    """The surface with other heights; horizons are renewed only around cells that moved by more than a wall."""
+    height_mm = np.ascontiguousarray(height_mm, dtype=np.float64)
+    moved = np.abs(height_mm - scene.height_mm) > WALL_MM
+    horizon = scene.horizon
+    if moved.any():
+        reach = round(HORIZON_MM / scene.field.cell_mm)
+        j, i = np.nonzero(moved)
+        rows, columns = height_mm.shape
+        window = (
+            max(0, int(j.min()) - reach),
+            min(rows, int(j.max()) + reach + 1),
+            max(0, int(i.min()) - reach),
+            min(columns, int(i.max()) + reach + 1),
+        )
+        horizon = horizon.copy()
+        _renew_horizons(horizon, height_mm, scene.field.cell_mm, window)
     return Surface(
-        field,
-        height_mm,
-        slopes(height_mm, field.cell_mm),
-        _horizons(height_mm, _highest_around(height_mm, reach), field.cell_mm, reach),
-        _walls(height_mm, field),
+        scene.field, height_mm, slopes(height_mm, scene.field.cell_mm), horizon, _walls(height_mm, scene.field)
     )
+
+
+def _renew_horizons(
+    horizon: NDArray[np.float32], height_mm: NDArray[np.float64], cell_mm: float, window: tuple[int, int, int, int]
+) -> None:
+    """Horizons of the cells in a window (first row, end, first column, end), in place."""
+    reach = round(HORIZON_MM / cell_mm)
+    _horizons(horizon, height_mm, _highest_around(height_mm, reach), cell_mm, reach, *window)
 
 
 def slopes(height_mm: NDArray[np.float64], cell_mm: float) -> NDArray[np.float32]:
@@ -72,20 +98,27 @@ def _highest_around(height_mm: NDArray[np.float64], reach: int) -> NDArray[np.fl
 
 @numba.njit(cache=True)
 def _horizons(
-    height_mm: NDArray[np.float64], highest_mm: NDArray[np.float64], cell_mm: float, reach: int
-) -> NDArray[np.float32]:
+    out: NDArray[np.float32],
+    height_mm: NDArray[np.float64],
+    highest_mm: NDArray[np.float64],
+    cell_mm: float,
+    reach: int,
+    j0: int,
+    j1: int,
+    i0: int,
+    i1: int,
+) -> None:
     rows, columns = height_mm.shape
-    out = np.zeros((rows, columns, AZIMUTHS), dtype=np.float32)
     for a in range(AZIMUTHS):
         angle = 2 * np.pi * a / AZIMUTHS
         dx, dy = np.cos(angle), np.sin(angle)
-        for j in range(rows):
-            for i in range(columns):
+        for j in range(j0, j1):
+            for i in range(i0, i1):
                 z, top = height_mm[j, i], highest_mm[j, i]
                 best = 0.0
                 if top - z > WALL_MM:
                     for s in range(1, reach + 1):
-                        ii, jj = int(round(i + s * dx)), int(round(j + s * dy))
+                        ii, jj = int(np.floor(i + s * dx + 0.5)), int(np.floor(j + s * dy + 0.5))
                         if ii < 0 or jj < 0 or ii >= columns or jj >= rows:
                             break
                         rise = height_mm[jj, ii] - z
@@ -94,7 +127,6 @@ def _horizons(
                         if best * s * cell_mm > top - z:
                             break
                 out[j, i, a] = best
-    return out
 
 
 def _walls(height_mm: NDArray[np.float64], field: MapField) -> NDArray[np.float64]:

@@ -67,7 +67,7 @@ def occupancy(
     on its surroundings is left out here; the final judgement predicts it.
     """
     band = found.band
-    every = max(1, found.gate.samples // (found.gate.last - found.gate.first))
+    every = found.gate.thinning
     left_over = found.gate.spectrum(found.measured[which] - found.gate.waveform(predicted))[..., ::every]
     table = directivity(found.predictor.radius_mm, band.nodes_hz, found.speed_mps)
     wave = 2 * np.pi * band.frequency_hz[::every] / (found.speed_mps * 1e3)

@@ -65,14 +65,10 @@ class ArrayDigitiser:
             The device refused a setting, or uses another value than it was given.
         """
         s = self._settings
-        for command in (
-            "*CLS",
-            f"CONF:RATE {s.sample_rate_hz:.9g}",
-            f"CONF:SAMP {s.samples}",
-            f"CONF:STAR {s.start_s:.9g}",
-            f"CONF:PULS {PULSE_NAMES[s.pulse]}",
-        ):
-            self._port.write(command)
+        self._port.write(
+            f"*CLS;:CONF:RATE {s.sample_rate_hz:.9g};:CONF:SAMP {s.samples}"
+            f";:CONF:STAR {s.start_s:.9g};:CONF:PULS {PULSE_NAMES[s.pulse]}"
+        )
         self._port.check_errors("configuring")
         for query, wanted in (
             ("CONF:RATE?", s.sample_rate_hz),
@@ -110,9 +106,7 @@ class ArrayDigitiser:
     def _ping(self) -> Ping:
         s = self._settings
         receivers = len(s.layout.receivers_mm)
-        self._port.write("INIT")
-        self._port.write("*TRG")
-        self._wait_complete()
+        self._emit()
         data = self._port.query_block("FETC:ECHO?", expected_bytes=2 * receivers * s.samples)
         block = np.frombuffer(data, dtype="<i2").reshape(receivers, s.samples).astype(np.int16)
         device_t_ns = self._whole("FETC:TIME?")
@@ -133,9 +127,10 @@ class ArrayDigitiser:
         if not self._configured:
             self.configure()
 
-    def _wait_complete(self) -> None:
+    def _emit(self) -> None:
         try:
-            answer = self._port.query("*OPC?")
+            # one line, one packet: separate small writes wait for each other on a socket (Nagle)
+            answer = self._port.query("INIT;*TRG;*OPC?")
         except DeviceSilentError as error:
             raise DeviceSilentError(
                 f"{self._port.label}: expected the ping to complete (*OPC?), but its trigger never came; "

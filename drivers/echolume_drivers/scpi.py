@@ -52,7 +52,7 @@ class ScpiPort:
         self._timeout_s = timeout_s
         self._line: _Line | None = None
         self._buffer = bytearray()
-        self._stale = False
+        self._quiet_s = 0.0
 
     @property
     def label(self) -> str:
@@ -86,7 +86,7 @@ class ScpiPort:
             ) from error
         self._line = cast(_Line, line)
         self._buffer.clear()
-        self._stale = False
+        self._quiet_s = 0.0
 
     def close(self) -> None:
         """Give the port back; closing twice is fine."""
@@ -96,7 +96,7 @@ class ScpiPort:
 
     def write(self, command: str) -> None:
         """Send one command line."""
-        if self._stale:
+        if self._quiet_s > 0:
             self._drain()
         line = self._connected()
         try:
@@ -214,7 +214,7 @@ class ScpiPort:
                 self._buffer += data
                 return
             if time.monotonic() > deadline_s:
-                self._stale = True
+                self._quiet_s = max(QUIET_S, self._timeout_s)  # the answer may yet come, late
                 raise DeviceSilentError(
                     f"{self.label}: expected {wanted} in answer to {asked!r}, got {len(self._buffer)} bytes "
                     f"by the deadline; check power and cable, then try again"
@@ -228,7 +228,7 @@ class ScpiPort:
         return out
 
     def _nonsense(self, asked: str, wanted: str, seen: str) -> ProtocolError:
-        self._stale = True
+        self._quiet_s = QUIET_S
         return ProtocolError(
             f"{self.label}: expected {wanted} in answer to {asked!r}, got {seen}; "
             f"check that the port belongs to this device and its firmware speaks this protocol"
@@ -244,12 +244,12 @@ class ScpiPort:
     def _drain(self) -> None:
         """Throw away late or unread answers until the line is quiet."""
         line = self._connected()
-        give_up_s = time.monotonic() + self._timeout_s + QUIET_S
         quiet_since_s = time.monotonic()
-        while time.monotonic() - quiet_since_s < QUIET_S:
+        give_up_s = quiet_since_s + 2 * (self._timeout_s + self._quiet_s)
+        while time.monotonic() - quiet_since_s < self._quiet_s:
             if self._read(line, max(1, line.in_waiting), "clearing the line"):
                 quiet_since_s = time.monotonic()
             if time.monotonic() > give_up_s:
                 raise self._nonsense("nothing", "a quiet line", "data without end")
         self._buffer.clear()
-        self._stale = False
+        self._quiet_s = 0.0

@@ -20,11 +20,14 @@ from echolume_messages.types import EchoBlock
 REFERENCE_PATH_MM = 300.0
 REFERENCE_COUNTS = 12000.0
 """Peak over a perpendicular plate at 150 mm, nominal channel."""
-OVERSAMPLING = 8
+OVERSAMPLING = 4
 FADE_FROM_TAN, FADE_TO_TAN = 1.0, 1.5
 """Facets fade out between these tangents of the angle seen from the array: the beam has died by then."""
 SCATTER_MM = 0.05
 """Incoherent scattering of a rough surface: amplitude of a patch of 1 mm."""
+
+DILATION_MM = 15.0
+"""No ray to a receiver strays further than this, below the scene's top, from the ray to the emitter."""
 
 _surfaces: dict[int, Surface] = {}
 _KEPT_SURFACES = 4
@@ -32,7 +35,7 @@ _KEPT_SURFACES = 4
 
 @dataclass(frozen=True)
 class Surface:
-    """A scene prepared for sound: facets, their random texture, and the terrain grown by 10 mm."""
+    """A scene prepared for sound: facets, their random texture, and the terrain grown by `DILATION_MM`."""
 
     scene: Scene
     facets: Facets
@@ -47,7 +50,7 @@ def surface_of(scene: Scene) -> Surface:
         return found
     facets = build_facets(scene)
     texture = SCATTER_MM * np.random.default_rng(len(facets.kind)).normal(size=len(facets.kind))
-    grown = maximum_filter(scene.front_mm, size=2 * round(10 / scene.cell_mm) + 1)
+    grown = maximum_filter(scene.front_mm, size=2 * round(DILATION_MM / scene.cell_mm) + 1)
     found = Surface(scene, facets, texture, grown)
     while len(_surfaces) >= _KEPT_SURFACES:
         _surfaces.pop(next(iter(_surfaces)))

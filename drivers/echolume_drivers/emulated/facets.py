@@ -11,7 +11,7 @@ from echolume_drivers.emulated.scene import Scene
 
 MERGE = 4
 """Largest facet in the field, in cells; its aperture is integrated exactly to second order."""
-BENCH_FACET_MM = 8.0
+BENCH_FACET_MM = 4.0
 BENCH_MM = 344.0
 """The bench goes on this far at z = 0."""
 WALL_MM = 0.05

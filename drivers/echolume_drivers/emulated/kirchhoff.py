@@ -17,6 +17,14 @@ BANDS = 5
 """Bands of the history; the loops over them are unrolled."""
 OBSTACLE_MM = 0.3
 """An obstacle must rise this far above a facet to count."""
+DARK = -3.0
+"""Hidden by so many Fresnel radii, a facet adds nothing."""
+
+
+@njit(cache=True, fastmath=True)
+def _ground(heights: NDArray[np.float64], x0: float, y0: float, cell: float, x: float, y: float) -> float:
+    i, j = math.floor((x - x0) / cell), math.floor((y - y0) / cell)
+    return heights[j, i] if 0 <= i < heights.shape[1] and 0 <= j < heights.shape[0] else 0.0
 
 
 @njit(cache=True, fastmath=True)
@@ -41,18 +49,16 @@ def clearance(
         return 9.0
     length = math.sqrt(lateral * lateral + dz * dz)
     least = 9.0
-    rows, columns = heights.shape
     steps = int(min(1.0, (top + 4.0 - pz) / dz) * lateral / cell)
     for k in range(1, steps + 1):
         t = k * cell / lateral
-        i = math.floor((px + t * dx - x0) / cell)
-        j = math.floor((py + t * dy - y0) / cell)
-        if 0 <= i < columns and 0 <= j < rows:
-            ground = heights[j, i]
-            if ground > pz + OBSTACLE_MM:
-                above = (pz + t * dz - ground) * lateral / length
-                radius = math.sqrt(wavelength * length * max(t * (1 - t), 1e-3))
-                least = min(least, above / radius)
+        ground = _ground(heights, x0, y0, cell, px + t * dx, py + t * dy)
+        if ground > pz + OBSTACLE_MM:
+            above = (pz + t * dz - ground) * lateral / length
+            radius = math.sqrt(wavelength * length * max(t * (1 - t), 1e-3))
+            least = min(least, above / radius)
+            if least < DARK:
+                break
     return least
 
 
@@ -63,12 +69,19 @@ def soft(nu: float) -> float:
         return 1.0
     if nu >= 0.0:
         return 1.0 - 0.5 * math.exp(-3.0 * nu)
-    return 0.5 * math.exp(2.0 * nu)
+    return 0.5 * math.exp(2.0 * nu) if nu > DARK else 0.0
+
+
+_SINC_STEP = 1 / 64
+_SINC_END = 24.0
+_SINC = np.sinc(np.arange(0, _SINC_END + 2 * _SINC_STEP, _SINC_STEP) / np.pi)
 
 
 @njit(cache=True, fastmath=True)
 def _sinc(x: float) -> float:
-    return 1.0 - x * x / 6.0 if abs(x) < 0.02 else math.sin(x) / x
+    at = min(abs(x), _SINC_END) / _SINC_STEP
+    n = int(at)
+    return _SINC[n] + (at - n) * (_SINC[n + 1] - _SINC[n])
 
 
 @njit(cache=True, fastmath=True)
@@ -87,13 +100,10 @@ def _floor_free(
 ) -> float:
     """Share of the floor between a wall point and its mirror point towards the array that is there and free."""
     t = (wz - floor) / (wz - floor + ez - floor)
-    rows, columns = heights.shape
     good = 0
     for k in range(1, 6):
         s = t * k / 4.0
-        x, y = wx + s * (ex - wx), wy + s * (ey - wy)
-        i, j = math.floor((x - x0) / cell), math.floor((y - y0) / cell)
-        ground = heights[j, i] if 0 <= i < columns and 0 <= j < rows else 0.0
+        ground = _ground(heights, x0, y0, cell, wx + s * (ex - wx), wy + s * (ey - wy))
         if abs(ground - floor) < OBSTACLE_MM:
             good += 1
         elif ground > floor:
@@ -158,9 +168,12 @@ def accumulate(
             away = sign[f] * ((ex - px) if kind[f] == 1 else (ey - py))
             if away <= 0 and abs(away) > 40.0:
                 continue
-        open_sky = not wall and clearance(
-            dilated, x0, y0, cell, top, mx, my, pz, ex, ey, ez, wavelength
-        ) > 4.0  # fmt: skip
+        # nothing higher near the facet, nor near its way up: then every element sees it
+        open_sky = (
+            not wall
+            and _ground(dilated, x0, y0, cell, px, py) < pz + OBSTACLE_MM
+            and clearance(dilated, x0, y0, cell, top, px, py, pz, ex, ey, ez, wavelength) > 4.0
+        )
         for image in range(2 if wall else 1):
             for e in range(receivers + 1):
                 qx, qy, qz = elements[e, 0], elements[e, 1], elements[e, 2]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import j1
@@ -24,7 +26,7 @@ def speed_of_sound_mps(temperature_c: float) -> float:
     return float(331.3 * np.sqrt(1 + temperature_c / 273.15))
 
 
-def directivity(sine_squared: NDArray[np.float64], ka: float) -> NDArray[np.float64]:
+def directivity(sine_squared: NDArray[np.float64], ka: float | NDArray[np.float64]) -> NDArray[np.float64]:
     """Far-field directivity 2 J1(x) / x of a piston, x = ka sin(angle), at any shape of `sine_squared`."""
     x = np.maximum(ka * np.sqrt(np.maximum(sine_squared, 0)), 1e-9)
     return 2 * j1(x) / x
@@ -58,10 +60,10 @@ def _resonator(frequencies_hz: NDArray[np.float64], centre_hz: float, quality: f
 
 
 def _burst(frequencies_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
-    length_s = CYCLES / CARRIER_HZ
-    t_s = (np.arange(2048) + 0.5) * length_s / 2048
-    wave = np.sin(2 * np.pi * CARRIER_HZ * t_s) * (length_s / 2048)
-    return np.asarray(np.exp(-2j * np.pi * frequencies_hz[:, None] * t_s) @ wave, dtype=np.complex128)
+    """Fourier integral of whole cycles of a sine."""
+    f = np.where(frequencies_hz == CARRIER_HZ, CARRIER_HZ + 1e-3, frequencies_hz)
+    turned = np.exp(-2j * np.pi * f * (CYCLES / CARRIER_HZ))
+    return np.asarray((1 - turned) * CARRIER_HZ / (2 * np.pi * (CARRIER_HZ**2 - f**2)), dtype=np.complex128)
 
 
 def _band(frequencies_hz: NDArray[np.float64], low_hz: float, high_hz: float) -> NDArray[np.float64]:
@@ -95,13 +97,16 @@ def channel_spectra(
                 * _resonator(frequencies_hz, CARRIER_HZ * (1 + 0.3 * shift), float(truth.quality[n]))
             )
         rows.append(truth.gains[n] * pulse * np.exp(-2j * np.pi * frequencies_hz * truth.delays_s[n]))
-    return np.stack(rows) / _nominal_peak(array, wideband)
+    return np.stack(rows) / _nominal_peak(array.pulse, array.layout.low_hz, array.layout.high_hz)
 
 
-def _nominal_peak(array: ArraySettings, wideband: bool) -> float:
-    f = np.arange(0, 125e3, 50.0)
-    if wideband:
-        return float(2 * 50.0 * np.sum(_band(f, array.layout.low_hz, array.layout.high_hz)))
-    spectrum = _burst(f) * _resonator(f, CARRIER_HZ, EMITTER_QUALITY) * _resonator(f, CARRIER_HZ, 20.0)
+@lru_cache
+def _nominal_peak(pulse: str, low_hz: float, high_hz: float) -> float:
+    """Largest value in time of the nominal channel's pulse."""
+    step_hz = 50.0
+    f = np.arange(0, 125e3, step_hz)
+    if pulse == "wideband":
+        return float(2 * step_hz * np.sum(_band(f, low_hz, high_hz)))
+    spectrum = _burst(f) * _resonator(f, CARRIER_HZ, EMITTER_QUALITY) ** 2
     t_s = np.arange(0, 800e-6, 5e-7)
-    return float(np.max(np.abs(2 * 50.0 * np.exp(2j * np.pi * t_s[:, None] * f) @ spectrum)))
+    return float(np.max(np.abs(2 * step_hz * np.exp(2j * np.pi * t_s[:, None] * f) @ spectrum)))

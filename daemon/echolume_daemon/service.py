@@ -247,7 +247,7 @@ def _connect(name: str, rig: Rig, stop: threading.Event) -> Bus | None:
             return connect(
                 rig.bus.endpoint,
                 rig.name,
-                timeout_s=2.0,
+                timeout_s=1.0,
                 shared_memory=rig.bus.shared_memory,
                 journal_s=rig.bus.journal_s,
                 journal_mib=rig.bus.journal_mib,

@@ -7,10 +7,12 @@ import socket
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+
 from echolume_daemon import array, cameras, conductor, guide, robot
 from echolume_messages.bus import Bus, connect
 from echolume_messages.bus.router import open_router
@@ -259,7 +261,9 @@ class FakeRecorder:
         self._inbox = bus.subscribe([CAMERA_LEFT, CAMERA_RIGHT, ECHOES, LEDGER, SCAN_START], depth=256)
         self._durable = bus.publisher(DURABLE)
         self._stop = threading.Event()
-        bus.serve("recorder", {"open": self._open, "close": self._close, "status": lambda _b: {"archives": {self.scan: {}}}})
+        bus.serve(
+            "recorder", {"open": self._open, "close": self._close, "status": lambda _b: {"archives": {self.scan: {}}}}
+        )
         bus.declare_alive("recorder")
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
@@ -306,13 +310,13 @@ class Bench:
         self.left, self.right = FakeCamera(), FakeCamera(first_id=7)
         self.trigger = FakeTrigger([self.left, self.right])
         self.guide, self.robot, self.array = FakeGuide(self.trigger), FakeRobot(), FakeArray()
-        self._router = open_router(self.rig.bus.endpoint)
+        self._router = ExitStack()
         self._stop = threading.Event()
         self._threads: dict[str, threading.Thread] = {}
         self.codes: dict[str, int] = {}
 
     def __enter__(self) -> Bench:
-        self._router.__enter__()
+        self._router.enter_context(open_router(self.rig.bus.endpoint))
         self.bus = connect(self.rig.bus.endpoint, self.rig.name)
         self.recorder_bus = connect(self.rig.bus.endpoint, self.rig.name)
         self.recorder = FakeRecorder(self.recorder_bus)
@@ -337,6 +341,10 @@ class Bench:
             self._threads[name].start()
         wait_until(lambda: set(names or mains) <= self.bus.alive(), "services alive")
 
+    def kill_router(self) -> None:
+        """The router is gone from now on."""
+        self._router.close()
+
     def stop(self) -> None:
         """Stop the services and wait for their ends."""
         self._stop.set()
@@ -349,4 +357,4 @@ class Bench:
         self.recorder.close()
         self.recorder_bus.close()
         self.bus.close()
-        self._router.__exit__(None, None, None)
+        self.kill_router()

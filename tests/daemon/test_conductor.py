@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
 from daemon.bench import Bench, wait_until
 from echolume_daemon.client import ScanClient
 from echolume_messages.errors import (

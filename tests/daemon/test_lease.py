@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+
 from echolume_daemon.lease import LEASE_S, Lease
 from echolume_messages.errors import LeaseHeldError
 

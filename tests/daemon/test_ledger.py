@@ -46,7 +46,9 @@ def test_the_sums_close_whatever_happens(story: list) -> None:
     assert ledger.count()[2] == sum(len(t) for t in report["triggers"].values())
 
 
-@given(st.lists(st.one_of(events), max_size=30).flatmap(lambda story: st.tuples(st.just(story), st.permutations(story))))
+@given(
+    st.lists(st.one_of(events), max_size=30).flatmap(lambda story: st.tuples(st.just(story), st.permutations(story)))
+)
 def test_the_order_in_which_it_is_told_does_not_matter(stories: tuple[list, list]) -> None:
     first, second = Ledger(STEPS), Ledger(STEPS)
     tell(first, stories[0])

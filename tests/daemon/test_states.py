@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+
 from echolume_daemon.states import COMMANDS, TABLE, Event, RunState, accepted, follow
 from echolume_messages.errors import WrongStateError
 

@@ -6,8 +6,8 @@ Every laser-on is queued together with its own laser-off: an exposure is one pro
 
 that fits the board's receive buffer and goes out in one write, so the board has all of it or none. In laser mode
 stock Grbl lights M3 at rest only while the modal motion is G1; hence the move is always sent, even one of no length.
-A board that stays silent, counts wrongly or raises an alarm is reset at once (0x18 switches the laser off), and
-then the error is raised. Real rigs need a dead-man relay on laser-enable: stock Grbl has none.
+A board that stays silent is reset at once (0x18 switches the laser off); one that answers wrongly or raises an alarm
+is braked first, so that it keeps its position; then the error is raised. Real rigs need a dead-man relay on laser-enable: stock Grbl has none.
 """
 
 from __future__ import annotations
@@ -137,12 +137,13 @@ class GrblGuide:
         """Brake (``!``), wait for standstill, reset: laser off, position kept. Never waits for its turn."""
         self._link.send(b"!")
         deadline_s = time.monotonic() + MARGIN_S
-        state = ""
-        while not state.startswith(("Hold:0", "Alarm", "Idle")) and time.monotonic() < deadline_s:
+        while time.monotonic() < deadline_s:
             try:
-                state = self._link.report(0.2).state
+                if self._link.report(0.3).state.startswith(("Hold:0", "Alarm", "Idle")):
+                    break
             except DeviceSilentError:
-                break
+                break  # homing, or an alarm that answers nothing but a reset
+            time.sleep(0.02)
         self._reset()
 
     def status(self) -> GuideStatus:
@@ -189,8 +190,11 @@ class GrblGuide:
             raise
         except CancelledError:
             raise  # `stop` has seen to the board
-        except DeviceError:
+        except DeviceSilentError:
             self._reset()
+            raise
+        except DeviceError:
+            self.stop()
             raise
 
     def _reset(self) -> None:

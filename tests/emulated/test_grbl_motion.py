@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 
 import pytest
-from echolume_drivers.emulated.grbl_planner import Planner
-from echolume_drivers.emulated.motion_profile import Trapezoid
 from hypothesis import given
 from hypothesis import strategies as st
+
+from echolume_drivers.emulated.grbl_planner import Planner
+from echolume_drivers.emulated.motion_profile import Trapezoid
 
 moves = st.builds(
     Trapezoid,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+
 from echolume_drivers.emulated.grbl_parser import GrblError, parse
 
 

@@ -10,6 +10,7 @@ import tty
 from collections.abc import Iterator
 
 import pytest
+
 from echolume_drivers.emulated.grbl_peer import GrblPeer
 from echolume_drivers.emulated.scene import plate
 from echolume_drivers.emulated.stage import Stage

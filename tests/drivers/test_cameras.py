@@ -28,15 +28,13 @@ class Bench:
     """A camera's settings, and what stands for pulses on its trigger line."""
 
     settings: CameraSettings
-    trigger: Callable[[], None]
-    exhaust: Callable[[Camera], None]
-    """After this no frame comes any more."""
+    trigger: Callable[[Camera], None]
 
 
 def emulated(folder: Path) -> Iterator[Bench]:
     peer = CameraPeer(Stage(1, plate(), laser_on=True), "left", optical_truth(1))
     peer.start()
-    yield Bench(CameraSettings(address=peer.address), lambda: peer.fire(4e-3), lambda camera: None)
+    yield Bench(CameraSettings(address=peer.address), lambda camera: peer.fire(4e-3))
     peer.close()
 
 
@@ -45,11 +43,7 @@ def files(folder: Path) -> Iterator[Bench]:
         cv2.imwrite(str(folder / f"image-{k}.png"), np.full((1024, 1280), 10 * k + 5, dtype=np.uint8))
     (folder / "notes.txt").write_text("no image")
 
-    def exhaust(camera: Camera) -> None:
-        for _ in range(IMAGES):
-            camera.read(1.0)
-
-    yield Bench(CameraSettings(driver="files", address=str(folder)), lambda: None, exhaust)
+    yield Bench(CameraSettings(driver="files", address=str(folder)), lambda camera: camera.trigger())
 
 
 @pytest.fixture(params=[emulated, files], ids=["emulated", "files"])
@@ -68,7 +62,7 @@ def test_each_trigger_gives_one_frame_with_the_next_id(bench: Bench, camera: Cam
     camera.start()
     times_ns = []
     for k in range(3):
-        bench.trigger()
+        bench.trigger(camera)
         frame = camera.read(5.0)
         assert frame.frame_id == k + 1
         assert frame.pixels.shape == (1024, 1280)
@@ -80,13 +74,12 @@ def test_each_trigger_gives_one_frame_with_the_next_id(bench: Bench, camera: Cam
 
 def test_a_frame_knows_its_exposure_or_says_that_it_does_not(bench: Bench, camera: Camera) -> None:
     camera.start()
-    bench.trigger()
+    bench.trigger(camera)
     assert camera.read(5.0).exposure_s in (4e-3, None)
 
 
 def test_without_a_trigger_the_camera_is_silent_and_says_so_in_time(bench: Bench, camera: Camera) -> None:
     camera.start()
-    bench.exhaust(camera)
     begin_s = time.monotonic()
     with pytest.raises(DeviceSilentError, match=r"camera left"):
         camera.read(0.1)
@@ -96,22 +89,26 @@ def test_without_a_trigger_the_camera_is_silent_and_says_so_in_time(bench: Bench
 def test_after_stop_and_start_the_ids_begin_anew(bench: Bench, camera: Camera) -> None:
     camera.start()
     for _ in range(2):
-        bench.trigger()
+        bench.trigger(camera)
         camera.read(5.0)
     camera.stop()
     camera.start()
-    bench.trigger()
+    bench.trigger(camera)
     assert camera.read(5.0).frame_id == 1
 
 
 def test_frames_not_read_before_stop_are_forgotten(bench: Bench, camera: Camera) -> None:
     camera.start()
-    bench.trigger()
-    bench.trigger()
+    bench.trigger(camera)
+    bench.trigger(camera)
     camera.stop()
     camera.start()
-    bench.trigger()
+    bench.trigger(camera)
     assert camera.read(5.0).frame_id == 1
+
+
+def test_a_camera_without_a_wire_says_so(bench: Bench, camera: Camera) -> None:
+    assert camera.software_trigger == (bench.settings.driver == "files")
 
 
 def test_calls_out_of_order_are_refused(bench: Bench) -> None:
@@ -121,6 +118,8 @@ def test_calls_out_of_order_are_refused(bench: Bench) -> None:
     camera.open()
     with pytest.raises(DeviceFaultError, match=r"read.. before start"):
         camera.read(0.1)
+    with pytest.raises(DeviceFaultError, match=r"trigger.. before start"):
+        camera.trigger()
     camera.close()
     with pytest.raises(DeviceFaultError, match=r"read.. before start"):
         camera.read(0.1)
@@ -130,7 +129,7 @@ def test_opening_twice_and_closing_twice_change_nothing(bench: Bench) -> None:
     camera = open_camera(bench.settings, "left")
     camera.open()
     camera.start()
-    bench.trigger()
+    bench.trigger(camera)
     assert camera.read(5.0).frame_id == 1
     camera.close()
     camera.close()
@@ -141,7 +140,7 @@ def test_a_closed_camera_can_be_opened_again(bench: Bench, camera: Camera) -> No
     camera.close()
     camera.open()
     camera.start()
-    bench.trigger()
+    bench.trigger(camera)
     assert camera.read(5.0).frame_id == 1
 
 
@@ -156,6 +155,7 @@ def test_frames_of_another_size_than_the_rig_file_says_are_refused(bench: Bench)
     with pytest.raises(DeviceError, match=r"640[\s\S]*rig file|rig file[\s\S]*640|640.*width_px"):
         camera.open()
         camera.start()
+        bench.trigger(camera)
         camera.read(1.0)
     camera.close()
 
@@ -170,7 +170,12 @@ def test_files_come_in_the_order_of_their_names_and_in_grey(tmp_path: Path) -> N
         cv2.imwrite(str(tmp_path / name), np.full((8, 8, 3), level, dtype=np.uint8))
     camera = open_camera(CameraSettings(driver="files", address=str(tmp_path), width_px=8, height_px=8), "left")
     camera.start()
-    assert [int(camera.read(1.0).pixels[0, 0]) for _ in range(3)] == [10, 20, 30]
+    for level in (10, 20, 30):
+        camera.trigger()
+        assert camera.read(1.0).pixels[0, 0] == level
+    camera.trigger()
+    with pytest.raises(DeviceSilentError, match=r"no frame 4: only 3 images"):
+        camera.read(1.0)
     camera.close()
 
 
@@ -178,6 +183,7 @@ def test_a_file_that_is_no_image_is_named(tmp_path: Path) -> None:
     (tmp_path / "broken.png").write_bytes(b"\x89PNG of nothing")
     camera = open_camera(CameraSettings(driver="files", address=str(tmp_path)), "left")
     camera.start()
+    camera.trigger()
     with pytest.raises(DeviceError, match=r"broken.png"):
         camera.read(1.0)
     camera.close()

@@ -38,6 +38,15 @@ class Camera(Protocol):
         """Take triggers from now on; frame ids start anew."""
         ...
 
+    @property
+    def software_trigger(self) -> bool:
+        """Whether no trigger wire reaches this camera: then `trigger` has to be called for every pulse."""
+        ...
+
+    def trigger(self) -> None:
+        """Take one frame; from any thread, also while another one reads. Cameras on the trigger wire ignore it."""
+        ...
+
     def read(self, timeout_s: float) -> CameraFrame:
         """The next frame; ``DeviceSilentError`` if none comes in time."""
         ...
@@ -77,6 +86,15 @@ class CheckedCamera(ABC):
         if not self._is_started:
             self._start()
             self._is_started = True
+
+    @property
+    def software_trigger(self) -> bool:
+        """See `Camera`."""
+        return False
+
+    def trigger(self) -> None:
+        """See `Camera`."""
+        self._require(self._is_started, "trigger", "start")
 
     def read(self, timeout_s: float) -> CameraFrame:
         """See `Camera`."""

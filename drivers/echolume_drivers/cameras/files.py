@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from echolume_drivers.cameras.camera import CameraFrame, CheckedCamera
 from echolume_messages.errors import DeviceAbsentError, DeviceSilentError, ProtocolError
+from echolume_messages.rig import CameraSettings
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm"})
 
@@ -16,8 +18,21 @@ SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm"})
 class FilesCamera(CheckedCamera):
     """`settings.address` is the folder; its images come in the order of their names, in grey."""
 
-    _images: tuple[Path, ...] = ()
-    _next: int = 0
+    def __init__(self, settings: CameraSettings, name: str) -> None:
+        super().__init__(settings, name)
+        self._images: tuple[Path, ...] = ()
+        self._next = 0
+        self._pulses = threading.Semaphore(0)
+
+    @property
+    def software_trigger(self) -> bool:
+        """No wire leads to a folder."""
+        return True
+
+    def trigger(self) -> None:
+        """Let `read` have one more image."""
+        super().trigger()
+        self._pulses.release()
 
     def _open(self) -> None:
         folder = Path(self.settings.address)
@@ -30,10 +45,13 @@ class FilesCamera(CheckedCamera):
 
     def _start(self) -> None:
         self._next = 0
+        self._pulses = threading.Semaphore(0)
 
     def _read(self, timeout_s: float) -> CameraFrame:
         import cv2
 
+        if not self._pulses.acquire(timeout=timeout_s):
+            raise DeviceSilentError(f"{self.where}: no frame within {timeout_s} s: it was not triggered")
         if self._next >= len(self._images):
             raise DeviceSilentError(
                 f"{self.where}: no frame {self._next + 1}: only {len(self._images)} images in the folder"

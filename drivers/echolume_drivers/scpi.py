@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import socket
 import time
 from typing import Protocol, cast
 
@@ -92,7 +93,10 @@ class ScpiPort:
         """Give the port back; closing twice is fine."""
         line, self._line = self._line, None
         if line is not None:
+            sock = getattr(line, "_socket", None)
             line.close()
+            if isinstance(sock, socket.socket):
+                sock.close()  # pyserial leaves it open when the other end has gone
 
     def write(self, command: str) -> None:
         """Send one command line."""
@@ -200,7 +204,7 @@ class ScpiPort:
 
     def _read(self, line: _Line, size: int, doing: str) -> bytes:
         try:
-            return line.read(size)
+            return line.read(max(size, line.in_waiting))
         except (serial.SerialException, OSError) as error:
             raise self._lost(doing, error) from error
 
@@ -209,7 +213,7 @@ class ScpiPort:
         line = self._connected()
         while True:
             doing = f"waiting for {wanted} in answer to {asked!r}"
-            data = self._read(line, max(size, line.in_waiting), doing)
+            data = self._read(line, size, doing)
             if data:
                 self._buffer += data
                 return
@@ -247,7 +251,7 @@ class ScpiPort:
         quiet_since_s = time.monotonic()
         give_up_s = quiet_since_s + 2 * (self._timeout_s + self._quiet_s)
         while time.monotonic() - quiet_since_s < self._quiet_s:
-            if self._read(line, max(1, line.in_waiting), "clearing the line"):
+            if self._read(line, 1, "clearing the line"):
                 quiet_since_s = time.monotonic()
             if time.monotonic() > give_up_s:
                 raise self._nonsense("nothing", "a quiet line", "data without end")

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+
 from echolume_messages.geometry import require_shape
 from echolume_messages.header import Header
 from echolume_messages.types import EchoBlock
-from numpy.typing import NDArray
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from echolume_messages.geometry import Points3, require_shape
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.special import j1
+
+from echolume_messages.geometry import Points3, require_shape
 
 
 def directivity(x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -6,12 +6,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from echolume_messages.calibration import ArrayCalibration
-from echolume_messages.errors import CalibrationRejectedError
-from echolume_messages.geometry import Matrix, Points3, require_shape, rotation_from_vector, transform
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from echolume_messages.calibration import ArrayCalibration
+from echolume_messages.errors import CalibrationRejectedError
+from echolume_messages.geometry import Matrix, Points3, require_shape, rotation_from_vector, transform
 from echolume_processing.ping import Ping
 from echolume_processing.ultrasonic.pipeline import (
     UPSAMPLING,
@@ -73,8 +73,11 @@ def raised_facets(points_mm: Points3, facet_mm: float = FACET_MM) -> tuple[Point
     inside = np.all((points_mm[:, :2] > low - 2) & (points_mm[:, :2] < high + 2), axis=1)
     near = points_mm[inside]
     apart, nearest = cKDTree(near[:, :2]).query(grid)
-    # Light leaves holes at the foot of a wall only: what is far from any point belongs to the plate.
-    on_top = (near[nearest, 2] > RAISED_MM) & (apart < facet_mm)
+    # Light leaves holes at the foot of a wall only: what lies further from a point than is usual on the block itself
+    # (half the pitch of the stripes) belongs to the plate.
+    inner = np.all((grid > low + 4 * facet_mm) & (grid < high - 4 * facet_mm), axis=1)
+    reach_mm = float(np.percentile(apart[inner], 95)) if inner.any() else facet_mm
+    on_top = (near[nearest, 2] > RAISED_MM) & (apart <= reach_mm)
     cell = np.floor((grid[on_top] - low) / facet_mm).astype(np.int64)
     _, group, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
     group = group.ravel()
@@ -159,7 +162,9 @@ def fit_block(
     limits = (LIMIT_MM, LIMIT_MM, LIMIT_RAD)
     loose = [n for n, s, limit in zip(NAMES, sigmas, limits, strict=True) if s > limit]
     if loose or explained < 0.3:
-        reason = f"leave undetermined: {', '.join(loose)}" if loose else f"explain {explained:.0%} of the block's echoes"
+        reason = (
+            f"leave undetermined: {', '.join(loose)}" if loose else f"explain {explained:.0%} of the block's echoes"
+        )
         raise CalibrationRejectedError(
             f"array calibration: {len(pings)} pings over the block {reason}; raster across all four edges of the block "
             "that the pass 'block-light' saw, at 10 mm pitch"

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
+
 from echolume_messages.calibration import ArrayCalibration
 from echolume_messages.errors import CalibrationRejectedError
 from echolume_messages.geometry import Matrix, Points3, robot_from_flange, rotation_from_euler, transform
 from echolume_messages.rig import ArraySettings
-from numpy.typing import NDArray
-
 from echolume_processing.ping import Ping
 from echolume_processing.ultrasonic.block import BlockFit, fit_block
 from echolume_processing.ultrasonic.pipeline import UPSAMPLING, UltrasonicPipeline, waveforms_from_counts
@@ -147,7 +147,9 @@ def calibrate_plate(pings: Sequence[Ping], settings: ArraySettings) -> ArrayResu
         return fit_plate(poses[kept], times[kept], temperatures[kept], emitter, receivers, nominal, direct, part)
 
     fit = fitted(np.ones(len(pings), dtype=np.bool_))
-    good = np.sqrt(np.nanmean(fit.residuals_mm**2, axis=1)) < max(MAX_RMS_MM, 4 * float(np.median(np.abs(fit.residuals_mm))))
+    good = np.sqrt(np.nanmean(fit.residuals_mm**2, axis=1)) < max(
+        MAX_RMS_MM, 4 * float(np.median(np.abs(fit.residuals_mm)))
+    )
     if np.count_nonzero(good) < MIN_PINGS or np.count_nonzero(good) < 0.7 * len(pings):
         raise CalibrationRejectedError(
             f"array calibration: only {int(np.count_nonzero(good))} of {len(pings)} pings fit the plate (rms "

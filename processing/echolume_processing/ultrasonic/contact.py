@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
+
 from echolume_messages.geometry import Points3, require_shape
 from echolume_messages.types import EchoKind
-from numpy.typing import NDArray
 
 MIN_CHANNELS = 4
 SLIP_MM = 1.5
@@ -194,14 +195,18 @@ def contact(
     point = fit_point(receivers_mm, paths_mm, kept)
     plane_score = _chi_squared(paths_mm, plane.paths_mm, sigma_mm, kept) if plane is not None else np.inf
     point_score = _chi_squared(paths_mm, point[1], sigma_mm, kept) if point is not None else np.inf
-    if plane is not None and plane_score <= min(point_score, max_chi_squared) and -plane.normal[2] >= np.cos(
-        max_tilt_rad
+    if (
+        plane is not None
+        and plane_score <= min(point_score, max_chi_squared)
+        and -plane.normal[2] >= np.cos(max_tilt_rad)
     ):
         normals = np.tile(plane.normal, (len(receivers_mm), 1))
         return Contact(EchoKind.PLANE, plane_contacts(plane, receivers_mm), normals, kept, plane_score)
-    if point is not None and point_score <= min(plane_score, max_chi_squared) and point[0][2] >= np.cos(
-        max_tilt_rad
-    ) * np.linalg.norm(point[0]):
+    if (
+        point is not None
+        and point_score <= min(plane_score, max_chi_squared)
+        and point[0][2] >= np.cos(max_tilt_rad) * np.linalg.norm(point[0])
+    ):
         normal = -point[0] / np.linalg.norm(point[0])
         shape = (len(receivers_mm), 1)
         return Contact(EchoKind.POINT, np.tile(point[0], shape), np.tile(normal, shape), kept, point_score)

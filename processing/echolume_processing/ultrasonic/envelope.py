@@ -7,9 +7,10 @@ from functools import lru_cache
 from typing import TypeAlias
 
 import numpy as np
-from echolume_messages.geometry import require_shape
 from numpy.typing import NDArray
 from scipy import fft, signal
+
+from echolume_messages.geometry import require_shape
 
 Waveforms: TypeAlias = NDArray[np.float32]
 """Echoes of all receivers, shape (receivers, samples)."""

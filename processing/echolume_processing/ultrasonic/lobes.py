@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from echolume_messages.geometry import require_shape
 from numpy.typing import NDArray
+
+from echolume_messages.geometry import require_shape
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
+
 from echolume_messages.calibration import ArrayCalibration, Calibration
 from echolume_messages.geometry import apply, require_shape, robot_from_flange
 from echolume_messages.types import ULTRASONIC_POINT, EchoBlock, Structured
-from numpy.typing import NDArray
-
 from echolume_processing.ping import Ping
 from echolume_processing.ultrasonic.contact import contact
 from echolume_processing.ultrasonic.envelope import (
@@ -162,7 +162,9 @@ class UltrasonicPipeline:
     def _bank(self, samples: int, sample_rate_hz: float) -> MatchedFilter:
         found = self.calibration
         if abs(sample_rate_hz - found.sample_rate_hz) > 1e-6 * found.sample_rate_hz:
-            raise ValueError(f"the array was calibrated at {found.sample_rate_hz} Hz, these echoes have {sample_rate_hz}")
+            raise ValueError(
+                f"the array was calibrated at {found.sample_rate_hz} Hz, these echoes have {sample_rate_hz}"
+            )
         if samples not in self._banks:
             self._banks[samples] = matched_filter(
                 self._templates,
@@ -174,9 +176,7 @@ class UltrasonicPipeline:
             )
         return self._banks[samples]
 
-    def _energy(
-        self, waveforms: Waveforms, sample_rate_hz: float, start_s: float, speed: float
-    ) -> NDArray[np.float64]:
+    def _energy(self, waveforms: Waveforms, sample_rate_hz: float, start_s: float, speed: float) -> NDArray[np.float64]:
         first = max(0, int((MIN_PATH_MM / speed - start_s) * sample_rate_hz))
         passed = band_pass(waveforms[:, first:], sample_rate_hz, self.calibration.low_hz, self.calibration.high_hz)
         return energy(paper_envelope(passed, sample_rate_hz), sample_rate_hz) / self._template_energy

@@ -8,11 +8,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from echolume_messages.errors import CalibrationRejectedError
-from echolume_messages.geometry import Matrix, Points3, robot_from_flange, rotation_from_vector, transform
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from echolume_messages.errors import CalibrationRejectedError
+from echolume_messages.geometry import Matrix, Points3, robot_from_flange, rotation_from_vector, transform
 from echolume_processing.ultrasonic.acoustics import directivity
 
 CHANNEL_SIGMA_MM = 0.02

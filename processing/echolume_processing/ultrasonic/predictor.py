@@ -4,12 +4,12 @@ its top as Kirchhoff facets. No shadow, no double bounce."""
 from __future__ import annotations
 
 import numpy as np
-from echolume_messages.calibration import ArrayCalibration
-from echolume_messages.geometry import Points3
 from numpy.typing import NDArray
 from scipy import fft
 from scipy.special import j1
 
+from echolume_messages.calibration import ArrayCalibration
+from echolume_messages.geometry import Points3
 from echolume_processing.ultrasonic.envelope import Waveforms
 
 OVERSAMPLING = 8

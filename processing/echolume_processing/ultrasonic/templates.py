@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from echolume_messages.errors import CalibrationRejectedError
-from echolume_messages.geometry import robot_from_flange
 from numpy.typing import NDArray
 from scipy import signal
 
+from echolume_messages.errors import CalibrationRejectedError
+from echolume_messages.geometry import robot_from_flange
 from echolume_processing.ping import Ping
 from echolume_processing.ultrasonic.envelope import Waveforms, band_pass
 from echolume_processing.ultrasonic.pipeline import waveforms_from_counts
@@ -73,7 +73,9 @@ def cut_templates(
     low = max(0, int((after_s - first.start_s) * rate_hz))
     high = min(passed.shape[1], int((before_s - first.start_s) * rate_hz))
     if high - low < 16:
-        raise CalibrationRejectedError(f"array calibration: the echo of the plate lies outside the record ({after_s} s)")
+        raise CalibrationRejectedError(
+            f"array calibration: the echo of the plate lies outside the record ({after_s} s)"
+        )
     peak_at = low + np.argmax(envelope[:, low:high], axis=1)
     peaks = envelope[np.arange(len(passed)), peak_at]
     noise = np.median(envelope[:, -max(16, passed.shape[1] // 8) :], axis=1)

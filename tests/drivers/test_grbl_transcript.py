@@ -18,7 +18,7 @@ SETTINGS = "$20=1\r\n$22=1\r\n$32=1\r\n$100=250.000\r\n$110=6000.000\r\n$120=500
 
 
 class Script:
-    """Answers chunks of bytes; a chunk is one write of the driver."""
+    """Answers chunks of bytes; a chunk is one write of the driver, or one real-time byte."""
 
     def __init__(self) -> None:
         self.master, slave = os.openpty()
@@ -41,9 +41,11 @@ class Script:
                 data = os.read(self.master, 4096)
             except OSError:
                 return
-            self.written.append(data)
-            answer = self.answers.get(data, "ok\r\n" * data.count(b"\n"))
-            os.write(self.master, answer.encode())
+            pieces = [bytes([byte]) for byte in data] if data[-1:] in b"?!\x18" else [data]
+            for piece in pieces:  # real-time bytes may arrive glued together
+                self.written.append(piece)
+                answer = self.answers.get(piece, "ok\r\n" * piece.count(b"\n"))
+                os.write(self.master, answer.encode())
 
     def close(self) -> None:
         os.close(self.slave)

@@ -94,7 +94,9 @@ class Calibration(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     @property
     def digest(self) -> str:
         """SHA-256 of the canonical JSON text, first 16 hex digits."""
-        return hashlib.sha256(msgspec.json.encode(self)).hexdigest()[:16]
+        # Through the decoder once: a 0 in a list of floats is 0.0 after loading, and must be so before saving.
+        canonical = msgspec.json.decode(msgspec.json.encode(self), type=Calibration)
+        return hashlib.sha256(msgspec.json.encode(canonical)).hexdigest()[:16]
 
 
 def parse(data: bytes, where: str, rig: str | None = None) -> Calibration:

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
+
 from echolume_messages import topics
 from echolume_messages.bus import Bus, Subscription, connect
 from echolume_messages.bus.router import open_router
+from echolume_messages.codec import decode_header
 from echolume_messages.errors import (
     CommandRefusedError,
     DeviceSilentError,
@@ -57,10 +62,10 @@ def collect(sub: Subscription, n: int) -> list[int]:
     return out
 
 
-def until(condition: object, what: str) -> None:
+def until(condition: Callable[[], bool], what: str) -> None:
     deadline = time.monotonic() + DEADLINE_S
     tick = threading.Event()
-    while not condition():  # type: ignore[operator]
+    while not condition():
         assert time.monotonic() < deadline, f"not within {DEADLINE_S} s: {what}"
         tick.wait(0.005)
 
@@ -71,11 +76,8 @@ def drop_puts(bus: Bus, lost: set[int]) -> None:
     send = outbox._send
 
     def lossy(key: str, payload: bytes, header: bytes | None, encoding: str) -> None:
-        if header is not None:
-            from echolume_messages.codec import decode_header
-
-            if decode_header(header).seq in lost:
-                return
+        if header is not None and decode_header(header).seq in lost:
+            return
         send(key, payload, header, encoding)
 
     outbox._send = lossy  # type: ignore[method-assign]
@@ -150,14 +152,17 @@ def test_a_late_subscriber_gets_what_the_journal_holds(endpoint: str, rig: str) 
 
 
 def test_a_subscriber_without_refill_gets_the_newest(endpoint: str, rig: str) -> None:
-    with connect(endpoint, rig) as a, connect(endpoint, rig) as b:
-        with b.subscribe([topics.ECHOES], depth=2, refill=False) as sub:
-            pub = a.publisher(topics.ECHOES)
-            for k in range(50):
-                pub.put(echoes(k), trigger=k)
-                until(lambda k=k: _sees(sub, k), f"record {k} seen or overwritten")
-            assert collect(sub, 2)[-1] == 49
-            assert sub.stats["dropped"] > 0
+    with (
+        connect(endpoint, rig) as a,
+        connect(endpoint, rig) as b,
+        b.subscribe([topics.ECHOES], depth=2, refill=False) as sub,
+    ):
+        pub = a.publisher(topics.ECHOES)
+        for k in range(50):
+            pub.put(echoes(k), trigger=k)
+            until(lambda k=k: _sees(sub, k), f"record {k} seen or overwritten")
+        assert collect(sub, 2)[-1] == 49
+        assert sub.stats["dropped"] > 0
 
 
 def _sees(sub: Subscription, k: int) -> bool:
@@ -176,18 +181,21 @@ def test_a_reader_that_sleeps_loses_nothing_that_the_journal_holds(endpoint: str
 
 def test_what_no_journal_holds_any_more_is_counted_lost(endpoint: str, rig: str) -> None:
     frame = np.zeros((1024, 1280), dtype="u1")
-    with connect(endpoint, rig, journal_mib=4) as a, connect(endpoint, rig) as b:
-        with b.subscribe([topics.CAMERA_LEFT], depth=32, archive=False) as sub:
-            pub = a.publisher(topics.CAMERA_LEFT)
-            pub.put(frame, trigger=0)
-            assert collect(sub, 1) == [0]
-            drop_puts(a, {1, 2})
-            for k in range(1, 9):
-                pub.put(frame, trigger=k)
-                if k >= 3:
-                    until(lambda k=k: _high(sub) >= k, f"frame {k} arrives")
-            assert collect(sub, 6)[-1] == 8
-            assert sub.stats["lost"] in (0, 2)
+    with (
+        connect(endpoint, rig, journal_mib=4) as a,
+        connect(endpoint, rig) as b,
+        b.subscribe([topics.CAMERA_LEFT], depth=32, archive=False) as sub,
+    ):
+        pub = a.publisher(topics.CAMERA_LEFT)
+        pub.put(frame, trigger=0)
+        assert collect(sub, 1) == [0]
+        drop_puts(a, {1, 2})
+        for k in range(1, 9):
+            pub.put(frame, trigger=k)
+            if k >= 3:
+                until(lambda k=k: _high(sub) >= k, f"frame {k} arrives")
+        assert collect(sub, 6)[-1] == 8
+        assert sub.stats["lost"] in (0, 2)
 
 
 def _high(sub: Subscription) -> int:
@@ -196,16 +204,19 @@ def _high(sub: Subscription) -> int:
 
 def test_put_never_waits_for_a_reader_that_does_not_read(endpoint: str, rig: str) -> None:
     frame = np.zeros((1024, 1280), dtype="u1")
-    with connect(endpoint, rig, journal_mib=32) as a, connect(endpoint, rig) as b:
-        with b.subscribe([topics.CAMERA_LEFT], depth=2):
-            pub = a.publisher(topics.CAMERA_LEFT)
-            longest_s = 0.0
-            for k in range(60):
-                start = time.perf_counter()
-                pub.put(frame, trigger=k)
-                longest_s = max(longest_s, time.perf_counter() - start)
-            assert longest_s < 0.25
-            assert pub.stats["journal_bytes"] <= 32 << 20
+    with (
+        connect(endpoint, rig, journal_mib=32) as a,
+        connect(endpoint, rig) as b,
+        b.subscribe([topics.CAMERA_LEFT], depth=2),
+    ):
+        pub = a.publisher(topics.CAMERA_LEFT)
+        longest_s = 0.0
+        for k in range(60):
+            start = time.perf_counter()
+            pub.put(frame, trigger=k)
+            longest_s = max(longest_s, time.perf_counter() - start)
+        assert longest_s < 0.25
+        assert pub.stats["journal_bytes"] <= 32 << 20
 
 
 def test_a_restarted_publisher_is_told_from_the_one_before(endpoint: str, rig: str) -> None:
@@ -340,3 +351,67 @@ def test_close_sends_what_is_queued(endpoint: str, rig: str) -> None:
             for k in range(100):
                 pub.put(echoes(k), trigger=k)
         assert len(collect(sub, 100)) == 100
+
+
+_PUBLISH_AND_LEAVE = """
+import sys, numpy as np
+from echolume_messages import topics
+from echolume_messages.bus import connect
+bus = connect(sys.argv[1], sys.argv[2])
+bus.serve("guide", {"move": lambda body: body})
+bus.watch_alive(lambda service, alive: None)
+bus.subscribe([topics.ECHOES, topics.RUN_STATE])
+bus.publisher(topics.LEDGER).put_json({"last": "words"})
+if sys.argv[3] == "close":
+    bus.close()
+"""
+
+
+@pytest.mark.parametrize("how", ["close", "forget"])
+def test_a_process_ends_promptly_and_its_last_words_arrive(endpoint: str, rig: str, how: str) -> None:
+    with connect(endpoint, rig) as b, b.subscribe([topics.LEDGER]) as sub:
+        start_s = time.monotonic()
+        subprocess.run([sys.executable, "-c", _PUBLISH_AND_LEAVE, endpoint, rig, how], check=True, timeout=DEADLINE_S)
+        assert time.monotonic() - start_s < 5.0
+        message = sub.get(DEADLINE_S)
+        assert message is not None
+        assert message.json() == {"last": "words"}
+
+
+_SUBSCRIBE_AND_HANG = """
+import sys, time
+from echolume_messages import topics
+from echolume_messages.bus import connect
+with connect(sys.argv[1], sys.argv[2]) as bus, bus.subscribe([topics.CAMERA_LEFT], depth=8) as sub:
+    sub.get(10.0)
+    print("hangs", flush=True)
+    sub.get(60.0)
+"""
+
+
+def test_a_process_that_is_stopped_stalls_nobody(endpoint: str, rig: str) -> None:
+    frame = np.zeros((1024, 1280), dtype="u1")
+    pace = threading.Event()
+    with (
+        subprocess.Popen([sys.executable, "-c", _SUBSCRIBE_AND_HANG, endpoint, rig], stdout=subprocess.PIPE) as hung,
+        connect(endpoint, rig) as a,
+        connect(endpoint, rig) as b,
+        b.subscribe([topics.CAMERA_LEFT], depth=32) as sub,
+    ):
+        assert hung.stdout is not None
+        pub = a.publisher(topics.CAMERA_LEFT)
+        pub.put(frame, trigger=0)
+        assert hung.stdout.readline() == b"hangs\n"
+        hung.send_signal(signal.SIGSTOP)
+        longest_s, found = 0.0, collect(sub, 1)
+        for k in range(1, 61):
+            start_s = time.perf_counter()
+            pub.put(frame, trigger=k)
+            longest_s = max(longest_s, time.perf_counter() - start_s)
+            pace.wait(0.03)
+            found += collect(sub, 1)
+        found += collect(sub, 61 - len(found))
+        hung.kill()
+        assert found == list(range(61))
+        assert sub.stats["lost"] == 0
+        assert longest_s < 0.25

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from types import SimpleNamespace
 
 import msgspec
 import numpy as np
@@ -19,9 +20,15 @@ from echolume_drivers.emulated.stage import Stage
 from echolume_messages.errors import DeviceAbsentError, DeviceFaultError, DeviceSilentError, ProtocolError
 from echolume_messages.rig import ArraySettings
 
-TIMEOUT_S = 0.6
+TIMEOUT_S = 0.8
 SETTINGS = ArraySettings(port="none")
 TRUTH = array_truth(1, SETTINGS)
+
+
+@pytest.fixture(autouse=True)
+def sockets_close_at_once(monkeypatch):
+    """pyserial sleeps 0.3 s after closing a socket."""
+    monkeypatch.setattr("serial.urlhandler.protocol_socket.time", SimpleNamespace(sleep=lambda _: None))
 
 
 class Robot:

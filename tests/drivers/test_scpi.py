@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -15,6 +16,12 @@ from echolume_messages.errors import DeviceAbsentError, DeviceFaultError, Device
 
 TIMEOUT_S = 0.25
 HOSTILE = bytes(range(256)) * 3 + b"\r\n#;\n\n#0"
+
+
+@pytest.fixture(autouse=True)
+def sockets_close_at_once(monkeypatch):
+    """pyserial sleeps 0.3 s after closing a socket."""
+    monkeypatch.setattr("serial.urlhandler.protocol_socket.time", SimpleNamespace(sleep=lambda _: None))
 
 
 class Scripted:

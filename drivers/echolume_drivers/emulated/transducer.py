@@ -103,10 +103,10 @@ def channel_spectra(
 @lru_cache
 def _nominal_peak(pulse: str, low_hz: float, high_hz: float) -> float:
     """Largest value in time of the nominal channel's pulse."""
-    step_hz = 50.0
+    step_hz, fine = 50.0, 40_000
     f = np.arange(0, 125e3, step_hz)
     if pulse == "wideband":
-        return float(2 * step_hz * np.sum(_band(f, low_hz, high_hz)))
-    spectrum = _burst(f) * _resonator(f, CARRIER_HZ, EMITTER_QUALITY) ** 2
-    t_s = np.arange(0, 800e-6, 5e-7)
-    return float(np.max(np.abs(2 * step_hz * np.exp(2j * np.pi * t_s[:, None] * f) @ spectrum)))
+        spectrum = _band(f, low_hz, high_hz).astype(np.complex128)
+    else:
+        spectrum = _burst(f) * _resonator(f, CARRIER_HZ, EMITTER_QUALITY) ** 2
+    return float(np.max(np.abs(np.fft.irfft(spectrum, n=fine)))) * fine * step_hz

@@ -147,10 +147,8 @@ class Cia402Robot:
                     self._recover(axis)
                 self._set_motion(axis, k)
             deadline_s = time.monotonic() + MARGIN_S
-            tried = [DriveState.NOT_READY_TO_SWITCH_ON] * len(self._axes)
-            while not all(axis.state is DriveState.OPERATION_ENABLED for axis in self._axes):
-                for k, axis in enumerate(self._axes):
-                    tried[k] = self._raise_one_step(axis, tried[k])
+            steps = [_BringUp(axis) for axis in self._axes]
+            while [step for step in steps if not step.advance()]:
                 if time.monotonic() > deadline_s:
                     raise self._late("to reach OPERATION ENABLED")
                 with self._news:
@@ -173,23 +171,6 @@ class Cia402Robot:
         axis.set(0x605A, 0, "h", QUICK_STOP_RAMP)
         if axis.read(0x6061, 0, "b") != PROFILE_POSITION:
             raise DeviceFaultError(f"{axis.where}: does not take profile position mode (0x6060)")
-
-    def _raise_one_step(self, axis: RobotAxis, tried: DriveState) -> DriveState:
-        axis.check()
-        state = axis.state
-        if state is DriveState.FAULT:
-            if tried is DriveState.FAULT:
-                axis.poll()
-                if axis.state is DriveState.FAULT:
-                    axis.raise_fault()
-                return axis.state
-            axis.send(words.DISABLE_VOLTAGE)
-            axis.send(words.FAULT_RESET)
-        elif state in words.NEXT_CONTROLWORD and state is not tried:
-            axis.send(words.NEXT_CONTROLWORD[state])
-        elif not axis.is_fresh:
-            axis.poll()
-        return state
 
     # --- motion ----------------------------------------------------------------------------------------------
 
@@ -307,6 +288,41 @@ class Cia402Robot:
     def _late(self, what: str) -> DeviceSilentError:
         states = ", ".join(f"{name} {axis.state.value}" for name, axis in zip(AXES, self._axes, strict=True))
         return DeviceSilentError(f"{self._where}: too late {what}; states: {states}")
+
+
+class _BringUp:
+    """Takes one axis to OPERATION ENABLED, a step at a time; a lost frame is sent again."""
+
+    def __init__(self, axis: RobotAxis) -> None:
+        self._axis = axis
+        self._asked: DriveState | None = None
+        self._asked_s = 0.0
+        self._resets = 0
+
+    def advance(self) -> bool:
+        """Take the next step if it is due; True in OPERATION ENABLED."""
+        axis = self._axis
+        axis.check()
+        late = time.monotonic() - self._asked_s > POLL_S
+        if late and self._asked is not None:
+            axis.poll()
+        state = axis.state
+        if state is DriveState.OPERATION_ENABLED:
+            return True
+        if state is not self._asked or late:
+            self._asked, self._asked_s = state, time.monotonic()
+            self._ask(state)
+        return False
+
+    def _ask(self, state: DriveState) -> None:
+        if state is DriveState.FAULT:
+            if self._resets == 3:
+                self._axis.raise_fault()
+            self._resets += 1
+            self._axis.send(words.DISABLE_VOLTAGE)
+            self._axis.send(words.FAULT_RESET)
+        elif state in words.NEXT_CONTROLWORD:
+            self._axis.send(words.NEXT_CONTROLWORD[state])
 
 
 class _SetPoint:

@@ -167,7 +167,7 @@ def test_a_truncated_header_is_refused(header: Header, data: st.DataObject) -> N
         codec.decode_header(text[: data.draw(st.integers(0, len(text) - 1))])
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(headers, st.data())
 def test_a_header_with_a_wrong_byte_is_refused_or_is_a_header(header: Header, data: st.DataObject) -> None:
     text = bytearray(codec.encode_header(header))
@@ -198,6 +198,7 @@ def test_a_wrong_header_is_named(text: bytes, named: str) -> None:
         codec.decode_header(text)
 
 
+@settings(max_examples=40)
 @given(
     st.recursive(st.none() | st.booleans() | st.text() | finite, lambda v: st.lists(v) | st.dictionaries(st.text(), v))
 )

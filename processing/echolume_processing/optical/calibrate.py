@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import cv2
@@ -21,6 +22,8 @@ MIN_VIEWS = 4
 OUTLIER_RATIO = 3.0
 OUTLIER_FLOOR_PX = 0.5
 """A view is left out if its residual is above this and above OUTLIER_RATIO times the median view's."""
+K3_SIGMAS = 3.0
+"""k3 is held at 0 unless it stands out from its own sigma: otherwise it only bends the image beyond the boards."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +129,8 @@ def calibrate_cameras(
 
     Notes
     -----
-    Each camera is calibrated alone first (five distortion coefficients), then both together from there. Views whose
+    Each camera is calibrated alone first (five distortion coefficients, k3 only if the views determine it), then
+    both together from there. Views whose
     residual stands out are left out, named, and the rest is calibrated again.
 
     References
@@ -177,15 +181,39 @@ def calibrate_views(
     )
 
 
+@contextmanager
+def _one_thread() -> Generator[None]:
+    """OpenCV's threads add up in any order, so the last bits of a solution would differ from run to run."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
+
+
 def _solve(views: Sequence[BoardView], board: Pattern, size_px: tuple[int, int]) -> _Solution:
+    with _one_thread():
+        return _solve_in_order(views, board, size_px)
+
+
+def _solve_in_order(views: Sequence[BoardView], board: Pattern, size_px: tuple[int, int]) -> _Solution:
     shape = [board.corners_mm.astype(np.float32)] * len(views)
     left = [v.left_px.astype(np.float32) for v in views]
     right = [v.right_px.astype(np.float32) for v in views]
-    alone = [cv2.calibrateCamera(shape, px, size_px, np.eye(3), np.zeros(5))[:3] for px in (left, right)]
+    free = [cv2.calibrateCameraExtended(shape, px, size_px, np.eye(3), np.zeros(5)) for px in (left, right)]
+    third = [abs(_vector(f[2])[4]) / _vector(f[5])[8] for f in free]  # |k3| over its sigma
+    if max(third) > K3_SIGMAS:
+        flags, alone = 0, [f[:3] for f in free]
+    else:
+        flags = cv2.CALIB_FIX_K3
+        alone = [
+            cv2.calibrateCamera(shape, px, size_px, np.eye(3), np.zeros(5), flags=flags)[:3] for px in (left, right)
+        ]
     (rms_l, k_l, d_l), (rms_r, k_r, d_r) = alone
     rms, k_l, d_l, k_r, d_r, rotation, shift, _, _, turns, shifts, per_view = cv2.stereoCalibrateExtended(
         shape, left, right, k_l, d_l, k_r, d_r, size_px, np.eye(3), np.zeros((3, 1)),
-        flags=cv2.CALIB_USE_INTRINSIC_GUESS,
+        flags=flags | cv2.CALIB_USE_INTRINSIC_GUESS,
         criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-7),
     )  # fmt: skip
     poses = [

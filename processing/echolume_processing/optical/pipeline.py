@@ -166,6 +166,7 @@ class OpticalPipeline:
         kept = select.choose(
             (sides[0].active_mm[..., 2], sides[1].active_mm[..., 2]),
             (stripes[0].amplitude_dn, stripes[1].amplitude_dn),
+            (stripes[0].width_px, stripes[1].width_px),
             (matches[0][0], matches[1][0]),
             rows_in_other,
             self._settings.run_rows,

@@ -9,6 +9,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 Values = NDArray[np.float64]
+WIDTH_LOG = 0.45
+"""Largest |log| of a lone candidate's width over the usual width."""
 CONTINUITY_MM = 0.8
 """Heights of one surface differ by less from row to row."""
 
@@ -52,6 +54,7 @@ def _near(flags: NDArray[np.bool_], rows: Values) -> NDArray[np.bool_]:
 def choose(
     z_mm: Sequence[Values],
     amplitude: Sequence[Values],
+    width_px: Sequence[Values],
     partner: Sequence[NDArray[np.int64]],
     rows_in_other: Sequence[Values],
     run_rows: int,
@@ -64,6 +67,8 @@ def choose(
         Heights of the active points, left and right; nan where a gate closed.
     amplitude : two of (rows, k)
         Stripe amplitudes.
+    width_px : two of (rows, k)
+        Stripe widths; alone, a candidate must be about as wide as those that both cameras agree on.
     partner : two of (rows, k) int
         Matched candidate in the other camera, -1 where there is none.
     rows_in_other : two of (rows, k)
@@ -85,7 +90,9 @@ def choose(
     rows_agreed = [np.asarray(a.any(axis=1), dtype=np.bool_) for a in agreed]
     alone: list[NDArray[np.bool_]] = []
     for i in (0, 1):
-        free = np.isfinite(z_mm[i]) & ~rows_agreed[i][:, None] & ~_near(rows_agreed[1 - i], rows_in_other[i])
+        usual_px = float(np.median(width_px[i][agreed[i]])) if agreed[i].any() else np.nan
+        odd = np.abs(np.log(width_px[i] / usual_px)) > WIDTH_LOG  # nothing is odd while no width is known
+        free = np.isfinite(z_mm[i]) & ~odd & ~rows_agreed[i][:, None] & ~_near(rows_agreed[1 - i], rows_in_other[i])
         alone.append(_strongest(amplitude[i], free))
     kept: list[NDArray[np.bool_]] = []
     for i in (0, 1):

@@ -89,13 +89,13 @@ class Pairs:
         """Take a frame; the (left, right) pair if that completes one."""
         key = message.header.scan, message.header.trigger, message.header.attempt
         other = self._halves.pop(key, None)
-        if other is None or other.topic is message.topic:
+        if other is None or other.topic == message.topic:
             self._halves[key] = message
             if len(self._halves) > MAX_HALVES:
                 del self._halves[next(iter(self._halves))]
                 self.unpaired += 1
             return None
-        return (message, other) if message.topic is topics.CAMERA_LEFT else (other, message)
+        return (message, other) if message.topic == topics.CAMERA_LEFT else (other, message)
 
 
 class OpticalSubscriber:

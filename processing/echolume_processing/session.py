@@ -1,0 +1,159 @@
+"""A whole scan at once: from its archive, or from gathered evidence, to the map and its files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypedDict
+
+import numpy as np
+
+from echolume_messages import archive as archives
+from echolume_messages import topics
+from echolume_messages.bus import Message
+from echolume_messages.errors import ArchiveError, CalibrationMissingError
+from echolume_processing import figures
+from echolume_processing.evidence import Evidence, ScanStart, read_start
+from echolume_processing.hybrid import ply, recording
+from echolume_processing.hybrid.baselines import Baselines, baselines
+from echolume_processing.hybrid.digest import digest
+from echolume_processing.hybrid.fuse import fuse
+from echolume_processing.hybrid.model import HybridMap
+from echolume_processing.optical.pipeline import OpticalPipeline
+from echolume_processing.ping import ping_from_record
+from echolume_processing.ultrasonic.pipeline import UltrasonicPipeline
+
+Progress = Callable[[str, int, int], None]
+"""Called with what is being done, how much of it is done, and how much there is (0: unknown)."""
+
+
+class Results(TypedDict):
+    """What a scan came to."""
+
+    scan: str
+    digest: str
+    files: list[str]
+    points: dict[str, int]
+    cells: dict[str, int]
+    registration: dict[str, float]
+    notes: list[str]
+
+
+def silent(what: str, done: int, total: int) -> None:
+    """Progress for nobody."""
+
+
+def reprocess(archive: Path, out: Path, progress: Progress = silent) -> Results:
+    """Rebuild the hybrid map of a scan from its raw archive, with the subscribers' own functions.
+
+    Parameters
+    ----------
+    archive
+        ``raw.mcap`` of a scan with a calibration; a torn one gives what it holds.
+    out
+        Folder for the map and its pictures; made if needed.
+    progress
+        Told what is going on.
+
+    Raises
+    ------
+    ArchiveError
+        If it is no archive, or holds no start of a scan.
+    CalibrationMissingError
+        If the scan was made without a calibration.
+    """
+    return conclude(gather(archive, progress), out, progress)[1]
+
+
+def gather(archive: Path, progress: Progress = silent) -> Evidence:
+    """Evidence of a scan from its raw archive."""
+    start = _start(archive)
+    if start.calibration is None:
+        raise CalibrationMissingError(
+            f"{archive}: scan {start.scan} was made without a calibration; run `echolume calibrate` first"
+        )
+    evidence = Evidence(start.scan, start.plan, start.calibration)
+    optical, ultrasonic = OpticalPipeline(start.calibration), UltrasonicPipeline(start.calibration)
+    kinds = {p.name: str(p.__struct_config__.tag) for p in start.plan.passes}
+    halves: dict[tuple[int, int], Message] = {}
+    wanted = (topics.CAMERA_LEFT, topics.CAMERA_RIGHT, topics.ECHOES)
+    for message in archives.read(archive, [t.name for t in wanted]):
+        header = message.header
+        if header.scan != start.scan:
+            continue
+        key = (header.trigger, header.attempt)
+        if message.topic == topics.ECHOES and kinds.get(header.pass_name) == "ultrasonic":
+            ping = ping_from_record(header, np.asarray(message.payload, dtype=np.int16))
+            evidence.add_ping(*key, ping)
+            evidence.add_ultrasonic(*key, ultrasonic.process(ping))
+            progress("pings", len(evidence.pings), 0)
+        elif message.topic != topics.ECHOES and kinds.get(header.pass_name) == "optical":
+            other = halves.pop(key, None)
+            if other is None or other.topic == message.topic:
+                halves[key] = message
+                continue
+            left, right = (message, other) if message.topic == topics.CAMERA_LEFT else (other, message)
+            x_mm = left.header.source.x_mm
+            if x_mm is None:
+                raise ArchiveError(f"{archive}: trigger {header.trigger}: the left frame carries no guide position")
+            frames = np.asarray(left.payload, dtype=np.uint8), np.asarray(right.payload, dtype=np.uint8)
+            evidence.add_optical(*key, optical.process(*frames, x_mm))
+            progress("stripes", len(evidence.optical), 0)
+    return evidence
+
+
+def conclude(evidence: Evidence, out: Path, progress: Progress = silent) -> tuple[HybridMap, Results]:
+    """Fuse gathered evidence and write the map: ``hybrid.ply``, ``map.npz``, ``hybrid.rrd``, ``figures/*.png``."""
+    out.mkdir(parents=True, exist_ok=True)
+    progress("fusing", 0, 3)
+    optical, ultrasonic = evidence.all_optical(), evidence.all_ultrasonic()
+    found = fuse(optical, evidence.all_pings(), evidence.calibration, evidence.plan.map)
+    others = baselines(optical, ultrasonic, evidence.plan.map)
+    progress("writing", 1, 3)
+    ply.write(found, out / "hybrid.ply")
+    save_maps(found, others, out / "map.npz")
+    recording.write(evidence, found, out / "hybrid.rrd")
+    progress("drawing", 2, 3)
+    drawn = figures.draw(optical, ultrasonic, found, others, out / "figures")
+    progress("done", 3, 3)
+    labels = np.bincount(found.cells["label"], minlength=5)
+    results = Results(
+        scan=evidence.scan,
+        digest=digest(found),
+        files=["hybrid.rrd", "hybrid.ply", "map.npz", *(f"figures/{path.name}" for path in drawn)],
+        points=evidence.counts(),
+        cells={label.name.lower(): int(labels[label]) for label in recording.LABELS},
+        registration={
+            "dz_mm": found.registration.dz_mm,
+            "speed_of_sound_mps": found.registration.speed_of_sound_mps,
+            "pings": found.registration.pings,
+            "residual_db": found.registration.residual_db,
+        },
+        notes=list(found.notes),
+    )
+    return found, results
+
+
+def save_maps(found: HybridMap, others: Baselines, path: Path) -> None:
+    """Every field of the hybrid map and the baselines' heights as images, in one ``.npz``."""
+    names = [n for n in found.cells.dtype.names or () if n not in ("ix", "iy")]
+    fields = {name: found.image(name) for name in names}
+    with path.open("wb") as stream:
+        np.savez(
+            stream,
+            allow_pickle=False,
+            **fields,
+            optical_mm=others.optical_mm.astype(np.float32),
+            ultrasonic_mm=others.ultrasonic_mm.astype(np.float32),
+            union_mm=others.union_mm.astype(np.float32),
+            x_mm=np.array(found.field.x_mm),
+            y_mm=np.array(found.field.y_mm),
+            cell_mm=np.array(found.field.cell_mm),
+        )
+
+
+def _start(archive: Path) -> ScanStart:
+    """The start of the scan that an archive holds."""
+    for message in archives.read(archive, [topics.SCAN_START.name]):
+        return read_start(message)
+    raise ArchiveError(f"{archive}: holds no {topics.SCAN_START.name}; it is no archive of a scan")

@@ -1,0 +1,182 @@
+"""The hybrid subscriber: gathers a scan's points and pings, and makes the map when its ledger is closed."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from echolume_messages import topics
+from echolume_messages.bus import Bus, Message
+from echolume_messages.errors import EcholumeError
+from echolume_messages.rig import Rig
+from echolume_processing.evidence import Evidence, read_start
+from echolume_processing.ping import ping_from_record
+from echolume_processing.session import conclude
+from echolume_processing.subscribers.frame import run_subscriber
+
+DEPTH = 256
+STALLED_S = 20.0
+"""After the final ledger, so long without anything new means that the rest will not come."""
+HELD_RECORDS = 2000
+"""Records of scans whose start is not known yet."""
+MAX_SCANS = 4
+
+log = logging.getLogger("echolume.hybrid")
+Json = dict[str, Any]
+
+
+@dataclass
+class _Scan:
+    """One scan while it runs."""
+
+    evidence: Evidence
+    kinds: dict[str, str]
+    lags_ms: list[float] = field(default_factory=list[float])
+    ledger: Json | None = None
+    last_s: float = field(default_factory=time.monotonic)
+
+    def missing(self) -> dict[str, list[int]]:
+        """Triggers that the ledger calls matched and that have not arrived in full, by pass."""
+        out: dict[str, list[int]] = {}
+        for name, triggers in cast("dict[str, list[int]]", (self.ledger or {}).get("triggers", {})).items():
+            have = self.evidence.optical.keys()
+            if self.kinds.get(name) == "ultrasonic":
+                have = self.evidence.pings.keys() & self.evidence.ultrasonic.keys()
+            elif self.kinds.get(name) != "optical":
+                continue
+            lacking = sorted(set(triggers) - set(have))
+            if lacking:
+                out[name] = lacking
+        return out
+
+
+class HybridSubscriber:
+    """Makes the hybrid map of every scan that has a calibration."""
+
+    def __init__(self, bus: Bus, rig: Rig, out: Path) -> None:
+        self._rig = rig.name
+        self._out = out
+        self._starts = bus.subscribe([topics.SCAN_START], depth=8)
+        self._records = bus.subscribe([topics.OPTICAL_POINTS, topics.ECHOES, topics.ULTRASONIC_POINTS], depth=DEPTH)
+        self._ledgers = bus.subscribe([topics.LEDGER], depth=16)
+        self._map = bus.publisher(topics.HYBRID_MAP)
+        self._done = bus.publisher(topics.HYBRID_DONE)
+        self._scans: dict[str, _Scan | None] = {}
+        self._held: dict[str, list[Message]] = {}
+        self._held_ledgers: dict[str, Json] = {}
+        self._counts = {"records": 0, "maps": 0, "dropped": 0}
+
+    def step(self, timeout_s: float) -> None:
+        """Wait for at most `timeout_s` for a record, and work on it."""
+        while (message := self._starts.get(0.0)) is not None:
+            self._begin(message)
+        while (message := self._ledgers.get(0.0)) is not None:
+            self._close_ledger(message)
+        record = self._records.get(timeout_s)
+        while record is not None:
+            self._take(record)
+            record = self._records.get(0.0)
+        for name, scan in list(self._scans.items()):
+            if scan is not None and scan.ledger is not None:
+                self._finish_if_complete(name, scan)
+
+    def health(self) -> dict[str, object]:
+        """Counts, scans in work, and the state of the subscription."""
+        running = [name for name, scan in self._scans.items() if scan is not None]
+        return {**self._counts, "running": running, "subscription": self._records.stats}
+
+    def close(self) -> None:
+        """Stop receiving."""
+        for subscription in (self._starts, self._records, self._ledgers):
+            subscription.close()
+
+    def _begin(self, message: Message) -> None:
+        name = message.header.scan
+        try:
+            start = read_start(message)
+            name = start.scan
+            found = None
+            if start.calibration is not None and start.calibration.rig == self._rig:
+                kinds = {p.name: str(p.__struct_config__.tag) for p in start.plan.passes}
+                found = _Scan(Evidence(start.scan, start.plan, start.calibration), kinds)
+            elif start.calibration is not None:
+                log.error("scan %s: its calibration is of rig %r; no map", name, start.calibration.rig)
+        except EcholumeError as error:
+            log.error("scan %s: no map: %s", name, error)
+            found = None
+        self._scans[name] = found
+        if len(self._scans) > MAX_SCANS:
+            del self._scans[next(iter(self._scans))]
+        for held in self._held.pop(name, []):
+            self._take(held)
+        if found is not None and name in self._held_ledgers:
+            found.ledger = self._held_ledgers.pop(name)
+
+    def _close_ledger(self, message: Message) -> None:
+        ledger = cast("Json", message.json())
+        if not ledger.get("final", False):
+            return
+        name = str(ledger["scan"])
+        if name not in self._scans:
+            self._held_ledgers[name] = ledger
+            if len(self._held_ledgers) > MAX_SCANS:
+                del self._held_ledgers[next(iter(self._held_ledgers))]
+            return
+        scan = self._scans[name]
+        if scan is not None:
+            scan.ledger = ledger
+            scan.last_s = time.monotonic()
+
+    def _take(self, message: Message) -> None:
+        header = message.header
+        if header.scan not in self._scans:
+            if sum(len(h) for h in self._held.values()) >= HELD_RECORDS:
+                self._counts["dropped"] += len(self._held.pop(next(iter(self._held))))
+            self._held.setdefault(header.scan, []).append(message)
+            return
+        scan = self._scans[header.scan]
+        if scan is None:
+            return
+        key = (header.trigger, header.attempt)
+        kind = scan.kinds.get(header.pass_name)
+        if message.topic == topics.OPTICAL_POINTS and kind == "optical":
+            scan.evidence.add_optical(*key, message.payload)
+        elif message.topic == topics.ULTRASONIC_POINTS and kind == "ultrasonic":
+            scan.evidence.add_ultrasonic(*key, message.payload)
+        elif message.topic == topics.ECHOES and kind == "ultrasonic":
+            scan.evidence.add_ping(*key, ping_from_record(header, np.asarray(message.payload, dtype=np.int16)))
+        else:
+            return
+        self._counts["records"] += 1
+        scan.last_s = time.monotonic()
+        if message.topic != topics.ECHOES:
+            scan.lags_ms.append((time.monotonic_ns() - header.t_ns) * 1e-6)
+
+    def _finish_if_complete(self, name: str, scan: _Scan) -> None:
+        missing = scan.missing()
+        if missing and time.monotonic() - scan.last_s < STALLED_S:
+            return
+        if missing:
+            log.error("scan %s: %s did not arrive; the map is made without", name, missing)
+        self._scans[name] = None
+        found, results = conclude(scan.evidence, self._out)
+        self._counts["maps"] += 1
+        log.info("scan %s: map of %d cells, digest %s", name, found.cells.size, results["digest"])
+        lag_ms = float(np.percentile(scan.lags_ms, 99)) if scan.lags_ms else 0.0
+        digest = scan.evidence.calibration.digest
+        self._map.put(found.cells, scan=name, calibration=digest)
+        self._done.put_json({**results, "lag_p99_ms": lag_ms, "missing": missing}, scan=name, calibration=digest)
+
+
+def main(
+    bus: Bus | None = None, rig: Rig | None = None, out: Path | None = None, stop: threading.Event | None = None
+) -> int:
+    """Run the subscriber until SIGTERM or SIGINT; files go to `out`, by default the working folder."""
+    folder = out or Path.cwd()
+    return run_subscriber("hybrid", lambda b, r: HybridSubscriber(b, r, folder), bus, rig, stop)

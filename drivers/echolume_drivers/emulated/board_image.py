@@ -150,7 +150,7 @@ def _stripe_pieces(board: Board, truth: OpticalTruth, side: Side, x_mm: float) -
     return images(truth.camera(side).packed, np.concatenate([ends[:-1], ends[1:]], axis=1)), brightness
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True)
 def _step(distance_mm: float, blur_mm: float) -> float:
     """From -1 to 1 over an edge at 0 that is blurred by a Gaussian."""
     t = distance_mm / (blur_mm * math.sqrt(2.0))
@@ -161,13 +161,13 @@ def _step(distance_mm: float, blur_mm: float) -> float:
     return math.erf(t)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True)
 def _edge(position_mm: float, edges: float, square_mm: float) -> float:
     """Number of the nearest of the inner edges, which lie at 0, 1, ... squares."""
     return min(max(math.floor(position_mm / square_mm + 0.5), 0.0), edges - 1.0)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True)
 def _checker(
     x: float, y: float, blur_x: float, blur_y: float, slant: float, columns: float, rows: float, square_mm: float
 ) -> float:
@@ -191,13 +191,13 @@ def _checker(
     return sign * value
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True)
 def _within(position_mm: float, blur_mm: float, low_mm: float, high_mm: float) -> float:
     """1 between the limits, 0 outside."""
     return 0.25 * (1 + _step(position_mm - low_mm, blur_mm)) * (1 + _step(high_mm - position_mm, blur_mm))
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True)
 def _albedo(
     x: float, y: float, blur_x: float, blur_y: float, slant: float, columns: float, rows: float, square: float
 ) -> float:

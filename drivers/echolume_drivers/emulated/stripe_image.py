@@ -62,10 +62,12 @@ def _pieces(
     grid = np.array([scene.x0_mm, scene.y0_mm, scene.cell_mm])
     plane = np.append(truth.laser_normal, truth.plane_offset_mm(x_mm))
     camera = truth.camera(side)
-    spans, kinds = cut(scene.optical_mm, scene.material, grid, plane, _FAN_MM, _PER_MM)
+    top_mm = max(0.0, float(scene.front_mm.max()), float(scene.optical_mm.max())) + 1e-6
+    relief_mm = top_mm - min(0.0, float(scene.optical_mm.min()))
+    spans, kinds = cut(scene.optical_mm, scene.material, grid, plane, _FAN_MM, _PER_MM, relief_mm)
     brightness = light(
         scene.optical_mm, scene.front_mm, scene.material, grid, spans, kinds,
-        truth.head_mm(x_mm), camera.centre_mm, SURFACES, TRANSMISSION,
+        truth.head_mm(x_mm), camera.centre_mm, SURFACES, TRANSMISSION, top_mm,
     )  # fmt: skip
     return spans, images(camera.packed, spans), brightness
 

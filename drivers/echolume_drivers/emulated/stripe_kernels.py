@@ -16,12 +16,12 @@ GLASS = 2
 TOP, WALL = 0, 1
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True)
 def _cell(value: float, origin_mm: float, cell_mm: float) -> int:
     return math.floor((value - origin_mm) / cell_mm)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True)
 def _height(field: Floats, ix: int, iy: int) -> float:
     """Height of a cell; the bench (0) goes on beyond the field."""
     if ix < 0 or iy < 0 or iy >= field.shape[0] or ix >= field.shape[1]:
@@ -76,7 +76,7 @@ def trace(
     return crossed
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True)
 def project(camera: Floats, x: float, y: float, z: float) -> tuple[float, float]:
     """Distorted image point (u, v) of a rig point; `camera` is CameraTruth.packed."""
     cx = camera[9] * x + camera[10] * y + camera[11] * z + camera[12]
@@ -111,10 +111,24 @@ def _top_height(optical: Floats, grid: Floats, plane: Floats, y: float, iy: int)
 
 
 @numba.njit(cache=True, nogil=True)
+def _put(spans: Floats, n: int, xa: float, ya: float, za: float, xb: float, yb: float, zb: float) -> None:
+    spans[n, 0], spans[n, 1], spans[n, 2] = xa, ya, za
+    spans[n, 3], spans[n, 4], spans[n, 5] = xb, yb, zb
+
+
+@numba.njit(cache=True, nogil=True)
 def cut(
-    optical: Floats, material: NDArray[np.uint8], grid: Floats, plane: Floats, y_mm: tuple[float, float], per_mm: int
+    optical: Floats,
+    material: NDArray[np.uint8],
+    grid: Floats,
+    plane: Floats,
+    y_mm: tuple[float, float],
+    per_mm: int,
+    relief_mm: float,
 ) -> tuple[Floats, NDArray[np.int64]]:
     """Cut the plane n.X = c (`plane` = n, c) with the optical surface, from low to high y.
+
+    There are `per_mm` pieces to the millimetre; no step between two cells is higher than `relief_mm`.
 
     Returns
     -------
@@ -125,7 +139,7 @@ def cut(
     """
     first, last = _cell(y_mm[0], grid[1], grid[2]), _cell(y_mm[1], grid[1], grid[2])
     per_cell = max(1, round(per_mm * grid[2]))
-    limit = (last - first + 1) * (per_cell + 2 + int(per_mm * (np.max(optical) - np.min(optical) + 1)))
+    limit = (last - first + 1) * (per_cell + 2 + int(per_mm * (relief_mm + 1)))
     spans = np.empty((limit, 6))
     kinds = np.empty((limit, 3), dtype=np.int64)
     n = 0
@@ -137,7 +151,7 @@ def cut(
             xa = (plane[3] - plane[1] * ya - plane[2] * za) / plane[0]
             xb = (plane[3] - plane[1] * yb - plane[2] * zb) / plane[0]
             ix = _cell(0.5 * (xa + xb), grid[0], grid[2])
-            spans[n] = np.array([xa, ya, za, xb, yb, zb])
+            _put(spans, n, xa, ya, za, xb, yb, zb)
             kinds[n, 0], kinds[n, 1] = TOP, 0
             kinds[n, 2] = _material(material, ix, iy)
             n += 1
@@ -152,14 +166,14 @@ def cut(
             za, zb = z_here + rise * k / pieces, z_here + rise * (k + 1) / pieces
             xa = (plane[3] - plane[1] * y_end - plane[2] * za) / plane[0]
             xb = (plane[3] - plane[1] * y_end - plane[2] * zb) / plane[0]
-            spans[n] = np.array([xa, y_end, za, xb, y_end, zb])
+            _put(spans, n, xa, y_end, za, xb, y_end, zb)
             kinds[n, 0], kinds[n, 1] = WALL, (-1 if rise > 0 else 1)
             kinds[n, 2] = _material(material, _cell(0.5 * (xa + xb), grid[0], grid[2]), owner)
             n += 1
     return spans[:n], kinds[:n]
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True)
 def _material(material: NDArray[np.uint8], ix: int, iy: int) -> int:
     if ix < 0 or iy < 0 or iy >= material.shape[0] or ix >= material.shape[1]:
         return 0
@@ -178,15 +192,15 @@ def light(
     eye: Floats,
     surface: Floats,
     transmission: float,
+    top_mm: float,
 ) -> Floats:
     """Brightness of each piece as the camera at `eye` sees it, shape (n,); 0 where dark, shadowed or hidden.
 
-    `surface` has a row per material: diffuse albedo, specular strength. Brightness 1 is white, lit at right angles
-    from the bench's distance to the head.
+    `surface` has a row per material: diffuse albedo, specular strength; nothing is higher than `top_mm`. Brightness 1
+    is white, lit at right angles from the bench's distance to the head.
     """
     n = spans.shape[0]
     out = np.zeros(n)
-    top_mm = max(np.max(optical), np.max(front)) + 1e-6
     reach_mm = head[2]
     start = np.empty(3)
     for i in range(n):

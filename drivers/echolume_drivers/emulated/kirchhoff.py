@@ -15,19 +15,21 @@ from numpy.typing import NDArray
 
 BANDS = 5
 """Bands of the history; the loops over them are unrolled."""
+WAY, COSINE, LIT, ALONG_U, ALONG_V, SPREAD, BEAM = range(7)
+"""How an element sees a facet: distance, cosine, visible share, direction in the facet, longer way, BANDS of beam."""
 OBSTACLE_MM = 0.3
 """An obstacle must rise this far above a facet to count."""
 DARK = -3.0
 """Hidden by so many Fresnel radii, a facet adds nothing."""
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath={"reassoc", "contract", "arcp", "nsz"})
 def _ground(heights: NDArray[np.float64], x0: float, y0: float, cell: float, x: float, y: float) -> float:
     i, j = math.floor((x - x0) / cell), math.floor((y - y0) / cell)
     return heights[j, i] if 0 <= i < heights.shape[1] and 0 <= j < heights.shape[0] else 0.0
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath={"reassoc", "contract", "arcp", "nsz"})
 def clearance(
     heights: NDArray[np.float64],
     x0: float,
@@ -62,7 +64,7 @@ def clearance(
     return least
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath={"reassoc", "contract", "arcp", "nsz"})
 def soft(nu: float) -> float:
     """Amplitude past an edge at `nu` first-Fresnel radii of clearance: half at the edge, fading into the shadow."""
     if nu > 4.0:
@@ -77,14 +79,14 @@ _SINC_END = 24.0
 _SINC = np.sinc(np.arange(0, _SINC_END + 2 * _SINC_STEP, _SINC_STEP) / np.pi)
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath={"reassoc", "contract", "arcp", "nsz"})
 def _sinc(x: float) -> float:
     at = min(abs(x), _SINC_END) / _SINC_STEP
     n = int(at)
     return _SINC[n] + (at - n) * (_SINC[n + 1] - _SINC[n])
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath={"reassoc", "contract", "arcp", "nsz"})
 def _floor_free(
     heights: NDArray[np.float64],
     x0: float,
@@ -111,7 +113,87 @@ def _floor_free(
     return good / 5.0
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath={"reassoc", "contract", "arcp", "nsz"})
+def _geometry(
+    px: float,
+    py: float,
+    pz: float,
+    kind: int,
+    sign: float,
+    size_u: float,
+    size_v: float,
+    mirror_mm: float,
+    elements: NDArray[np.float64],
+    axis: NDArray[np.float64],
+    radius: float,
+    table: NDArray[np.float32],
+    view: NDArray[np.float64],
+) -> None:
+    """Fill `view` (elements, 6 + BANDS) of one facet: see the column names above.
+
+    Elements are mirrored in the plane z = `mirror_mm` unless it is nan; LIT says only whether the facet faces them.
+    """
+    last = table.shape[0] - 1
+    mirrored = not math.isnan(mirror_mm)
+    for e in range(elements.shape[0]):
+        qz = 2 * mirror_mm - elements[e, 2] if mirrored else elements[e, 2]
+        dx, dy, dz = elements[e, 0] - px, elements[e, 1] - py, qz - pz
+        d = math.sqrt(dx * dx + dy * dy + dz * dz)
+        normal = dz if kind == 0 else (dx if kind == 1 else dy)
+        u = (dy if kind == 1 else dx) / d
+        v = (dy if kind == 0 else dz) / d
+        ahead = -(dx * axis[0] + dy * axis[1] + (-dz if mirrored else dz) * axis[2]) / d
+        view[e, WAY] = d
+        view[e, COSINE] = normal * sign / d
+        view[e, LIT] = 1.0 if view[e, COSINE] > 0 and ahead > 0 else 0.0
+        view[e, ALONG_U], view[e, ALONG_V] = u, v
+        # mean longer way over the facet and over the piston, which lie flat, not on a sphere
+        facet = (size_u * size_u * (1 - u * u) + size_v * size_v * (1 - v * v)) / 24.0
+        view[e, SPREAD] = (facet + radius * radius * (1 + ahead * ahead) / 8.0) / d
+        at = max(1.0 - ahead * ahead, 0.0) * last
+        n = min(int(at), last - 1)
+        for b in range(BANDS):
+            view[e, BEAM + b] = table[n, b] + (at - n) * (table[n + 1, b] - table[n, b])
+
+
+@njit(cache=True, fastmath={"reassoc", "contract", "arcp", "nsz"})
+def _deposit(
+    source: NDArray[np.float64],
+    views: NDArray[np.float64],
+    size_u: float,
+    size_v: float,
+    rough: float,
+    fade: float,
+    wavenumbers: NDArray[np.float64],
+    bin_mm: float,
+    start_mm: float,
+    history: NDArray[np.float32],
+) -> None:
+    """Add one facet's echo of the emitter seen as `source` to every receiver in `views`."""
+    bins = history.shape[1]
+    area = size_u * size_v
+    for e in range(1, views.shape[0]):
+        view = views[e]
+        lit = source[LIT] * view[LIT] * fade
+        if lit < 1e-3:
+            continue
+        way = source[WAY] + view[WAY]
+        at = (way + source[SPREAD] + view[SPREAD] - start_mm) / bin_mm
+        n = int(at)
+        if at < 0 or n + 1 >= bins:
+            continue
+        oblique = area * (source[COSINE] + view[COSINE]) / 2 + rough
+        weight = oblique * lit / (2 * math.pi * source[WAY] * view[WAY])
+        u = (source[ALONG_U] + view[ALONG_U]) * size_u / 2
+        v = (source[ALONG_V] + view[ALONG_V]) * size_v / 2
+        for b in range(BANDS):
+            k = wavenumbers[b]
+            value = weight * source[BEAM + b] * view[BEAM + b] * _sinc(k * u) * _sinc(k * v)
+            history[e - 1, n, b] += value * (1 - (at - n))
+            history[e - 1, n + 1, b] += value * (at - n)
+
+
+@njit(cache=True, fastmath={"reassoc", "contract", "arcp", "nsz"})
 def accumulate(
     centre: NDArray[np.float64],
     kind: NDArray[np.int8],
@@ -139,19 +221,11 @@ def accumulate(
     that of the pistons, `reach` the lateral distances where facets begin to fade and where they end, all in mm;
     `wavenumbers` (BANDS,) in 1/mm.
     """
-    receivers = elements.shape[0] - 1
-    bins = history.shape[1]
     x0, y0 = origin[0], origin[1]
     top = heights.max()
     wavelength = 2 * math.pi / wavenumbers[BANDS // 2]
-    last = table.shape[0] - 1
     ex, ey, ez = elements[0, 0], elements[0, 1], elements[0, 2]
-    r = np.empty((2, receivers + 1))
-    cosine = np.empty((2, receivers + 1))
-    along = np.empty((2, receivers + 1, 2))
-    spread = np.empty((2, receivers + 1))
-    lit = np.empty((2, receivers + 1))
-    beam = np.empty((2, receivers + 1, BANDS))
+    views = np.empty((2, elements.shape[0], BEAM + BANDS))
     for f in range(centre.shape[0]):
         px, py, pz = centre[f, 0], centre[f, 1], centre[f, 2]
         lateral = math.sqrt((px - ex) ** 2 + (py - ey) ** 2)
@@ -161,69 +235,34 @@ def accumulate(
         if lateral > reach[0]:
             fade = 0.5 + 0.5 * math.cos(math.pi * (lateral - reach[0]) / (reach[1] - reach[0]))
         wall = kind[f] != 0
+        size_u, size_v = size[f, 0], size[f, 1]
+        direct, image = views[0], views[1]
+        _geometry(px, py, pz, kind[f], sign[f], size_u, size_v, math.nan, elements, axis, radius, table, direct)
         # just outside the wall, so that a ray does not start inside its own column
         mx = px + (0.51 * cell * sign[f] if kind[f] == 1 else 0.0)
         my = py + (0.51 * cell * sign[f] if kind[f] == 2 else 0.0)
-        if wall:
-            away = sign[f] * ((ex - px) if kind[f] == 1 else (ey - py))
-            if away <= 0 and abs(away) > 40.0:
-                continue
         # nothing higher near the facet, nor near its way up: then every element sees it
         open_sky = (
             not wall
             and _ground(dilated, x0, y0, cell, px, py) < pz + OBSTACLE_MM
             and clearance(dilated, x0, y0, cell, top, px, py, pz, ex, ey, ez, wavelength) > 4.0
         )
-        for image in range(2 if wall else 1):
-            for e in range(receivers + 1):
+        for e in range(elements.shape[0]):
+            if direct[e, LIT] > 0 and not open_sky:
                 qx, qy, qz = elements[e, 0], elements[e, 1], elements[e, 2]
-                seen = 1.0
-                if image == 1:
-                    seen = lit[0, e] * _floor_free(heights, x0, y0, cell, mx, my, pz, qx, qy, qz, floor[f])
-                    qz = 2 * floor[f] - qz
-                elif not open_sky:
-                    seen = soft(clearance(heights, x0, y0, cell, top, mx, my, pz, qx, qy, qz, wavelength))
-                dx, dy, dz = qx - px, qy - py, qz - pz
-                d2 = dx * dx + dy * dy + dz * dz
-                d = math.sqrt(d2)
-                normal = dz if kind[f] == 0 else (dx if kind[f] == 1 else dy)
-                cosine[image, e] = normal * sign[f] / d
-                u = (dy if kind[f] == 1 else dx) / d
-                v = (dy if kind[f] == 0 else dz) / d
-                ahead = -(dx * axis[0] + dy * axis[1] + (-dz if image == 1 else dz) * axis[2]) / d
-                lit[image, e] = seen if cosine[image, e] > 0 and ahead > 0 else 0.0
-                r[image, e] = d
-                along[image, e, 0], along[image, e, 1] = u, v
-                # mean longer way over the facet and over the piston, which lie flat, not on a sphere
-                flat = (size[f, 0] ** 2 * (1 - u * u) + size[f, 1] ** 2 * (1 - v * v)) / 24.0
-                spread[image, e] = (flat + radius * radius * (1 + ahead * ahead) / 8.0) / d
-                at = (1.0 - ahead * ahead) * last
-                n = min(int(max(at, 0.0)), last - 1)
-                part = at - n
-                for b in range(BANDS):
-                    beam[image, e, b] = table[n, b] * (1 - part) + table[n + 1, b] * part
-        area = size[f, 0] * size[f, 1]
-        for source in range(2 if wall else 1):
-            if lit[source, 0] < 1e-3:
-                continue
-            for image in range(2 if wall else 1):
-                for e in range(1, receivers + 1):
-                    if lit[image, e] < 1e-3:
-                        continue
-                    r1, r2 = r[source, 0], r[image, e]
-                    weight = (
-                        (area * (cosine[source, 0] + cosine[image, e]) / 2 + texture[f] * math.sqrt(area))
-                        * fade * lit[source, 0] * lit[image, e] / (2 * math.pi * r1 * r2)
-                    )  # fmt: skip
-                    at = (r1 + r2 + spread[source, 0] + spread[image, e] - start_mm) / bin_mm
-                    n = int(at)
-                    if at < 0 or n + 1 >= bins:
-                        continue
-                    part = at - n
-                    u = (along[source, 0, 0] + along[image, e, 0]) * size[f, 0] / 2
-                    v = (along[source, 0, 1] + along[image, e, 1]) * size[f, 1] / 2
-                    for b in range(BANDS):
-                        k = wavenumbers[b]
-                        value = weight * beam[source, 0, b] * beam[image, e, b] * _sinc(k * u) * _sinc(k * v)
-                        history[e - 1, n, b] += value * (1 - part)
-                        history[e - 1, n + 1, b] += value * part
+                direct[e, LIT] = soft(clearance(heights, x0, y0, cell, top, mx, my, pz, qx, qy, qz, wavelength))
+            if direct[0, LIT] <= 0:
+                break
+        if direct[0, LIT] <= 0:
+            continue
+        rough = texture[f] * math.sqrt(size_u * size_v)
+        _deposit(direct[0], direct, size_u, size_v, rough, fade, wavenumbers, bin_mm, start_mm, history)
+        if wall:
+            _geometry(px, py, pz, kind[f], sign[f], size_u, size_v, floor[f], elements, axis, radius, table, image)
+            for e in range(elements.shape[0]):
+                qx, qy, qz = elements[e, 0], elements[e, 1], elements[e, 2]
+                free = _floor_free(heights, x0, y0, cell, mx, my, pz, qx, qy, qz, floor[f])
+                image[e, LIT] = min(image[e, LIT], direct[e, LIT]) * free
+            _deposit(direct[0], image, size_u, size_v, rough, fade, wavenumbers, bin_mm, start_mm, history)
+            _deposit(image[0], direct, size_u, size_v, rough, fade, wavenumbers, bin_mm, start_mm, history)
+            _deposit(image[0], image, size_u, size_v, rough, fade, wavenumbers, bin_mm, start_mm, history)

@@ -31,6 +31,7 @@ def run(args: argparse.Namespace) -> int:
         f"calibrated on  {found.calibrated_on} recordings (even numbers)\n"
         f"scored on      {found.scored_on} recordings (odd numbers)\n"
         f"delays         {delays} samples\n"
-        f"3D error       median {found.median_mm:.1f} mm, mean {found.mean_mm:.1f} mm, 90 % below {found.p90_mm:.1f} mm\n"
+        f"3D error       median {found.median_mm:.1f} mm, mean {found.mean_mm:.1f} mm, "
+        f"90 % below {found.p90_mm:.1f} mm\n"
     )
     return 0

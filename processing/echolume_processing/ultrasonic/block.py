@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from echolume_messages.calibration import ArrayCalibration
 from echolume_messages.errors import CalibrationRejectedError
@@ -72,18 +72,19 @@ def raised_facets(points_mm: Points3, facet_mm: float = FACET_MM) -> tuple[Point
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     inside = np.all((points_mm[:, :2] > low - 2) & (points_mm[:, :2] < high + 2), axis=1)
     near = points_mm[inside]
-    apart, nearest = cKDTree(near[:, :2]).query(grid)
+    query = KDTree(near[:, :2]).query(grid)
+    apart, nearest = np.asarray(query[0], dtype=np.float64), np.asarray(query[1], dtype=np.int64)
     # Light leaves holes at the foot of a wall only: what lies further from a point than is usual on the block itself
     # (half the pitch of the stripes) belongs to the plate.
     inner = np.all((grid > low + 4 * facet_mm) & (grid < high - 4 * facet_mm), axis=1)
-    reach_mm = float(np.percentile(apart[inner], 95)) if inner.any() else facet_mm
+    reach_mm = 1.2 * float(np.percentile(apart[inner], 99)) if inner.any() else facet_mm
     on_top = (near[nearest, 2] > RAISED_MM) & (apart <= reach_mm)
     cell = np.floor((grid[on_top] - low) / facet_mm).astype(np.int64)
     _, group, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
     group = group.ravel()
     columns = [grid[on_top, 0], grid[on_top, 1], near[nearest[on_top], 2]]
     centres = np.column_stack([np.bincount(group, c) / count for c in columns])
-    return centres, count * fine_mm**2
+    return centres, (count * fine_mm**2).astype(np.float64)
 
 
 def _moved(rig_from_robot: Matrix, offsets: NDArray[np.float64]) -> Matrix:

@@ -1,4 +1,4 @@
-"""Calibrate the array: templates and gains, delays, speed of sound, and its pose to the rig in six degrees of freedom."""
+"""Calibrate the array: templates, gains, delays, speed of sound, and its pose to the rig in six degrees of freedom."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ def _inverse(receivers: bytes, used: bytes) -> tuple[NDArray[np.float64], NDArra
     """Pseudo-inverses of the plane's rows (-2x, -2y, 1) and constant columns of the point's (2x, 2y)."""
     positions = np.frombuffer(receivers, dtype=np.float64).reshape(-1, 3)[np.frombuffer(used, dtype=np.bool_)]
     rows = np.column_stack([-2 * positions[:, 0], -2 * positions[:, 1], np.ones(len(positions))])
-    return np.linalg.pinv(rows), 2 * positions[:, :2]
+    return np.asarray(np.linalg.pinv(rows), dtype=np.float64), 2 * positions[:, :2]
 
 
 def fit_plane(receivers_mm: Points3, paths_mm: NDArray[np.float64], used: NDArray[np.bool_]) -> Plane | None:

@@ -20,11 +20,15 @@ CUTOFF_HZ = 1000.0
 """Cut-off of the paper's third-order Butterworth low-pass."""
 
 
-def band_weights(frequency_hz: NDArray[np.float64], low_hz: float, high_hz: float) -> NDArray[np.float64]:
+def band_weights(frequency_hz: NDArray[np.floating], low_hz: float, high_hz: float) -> NDArray[np.float64]:
     """Zero-phase band-pass: 1 within the band, cosine flanks of a fifth of the band's width outside it, shape (n,)."""
     flank_hz = max(0.2 * (high_hz - low_hz), 2000.0)
     outside_hz = np.maximum(np.maximum(low_hz - frequency_hz, frequency_hz - high_hz), 0.0)
-    return 0.5 * (1.0 + np.cos(np.pi * np.minimum(outside_hz / flank_hz, 1.0)))
+    return np.asarray(0.5 * (1.0 + np.cos(np.pi * np.minimum(outside_hz / flank_hz, 1.0))), dtype=np.float64)
+
+
+def _fast_length(at_least: int) -> int:
+    return int(fft.next_fast_len(at_least, real=True) or at_least)
 
 
 def band_pass(waveforms: Waveforms, sample_rate_hz: float, low_hz: float, high_hz: float) -> Waveforms:
@@ -41,8 +45,8 @@ def band_pass(waveforms: Waveforms, sample_rate_hz: float, low_hz: float, high_h
     """
     require_shape("waveforms", waveforms, (None, None))
     samples = waveforms.shape[1]
-    length = fft.next_fast_len(samples + samples // 4, real=True)
-    spectrum = fft.rfft(waveforms, length, axis=1)
+    length = _fast_length(samples + samples // 4)
+    spectrum = np.asarray(fft.rfft(waveforms, length, axis=1))
     weights = band_weights(np.fft.rfftfreq(length, 1.0 / sample_rate_hz), low_hz, high_hz).astype(np.float32)
     out: Waveforms = np.asarray(fft.irfft(spectrum * weights, length, axis=1), dtype=np.float32)
     return out[:, :samples]
@@ -114,7 +118,7 @@ class MatchedFilter:
     def compress(self, waveforms: Waveforms) -> ComplexEnvelope:
         """Complex matched-filter output, shape (receivers, upsampling * samples)."""
         samples = waveforms.shape[1]
-        spectrum = fft.rfft(waveforms, self.length, axis=1)
+        spectrum = np.asarray(fft.rfft(waveforms, self.length, axis=1))
         bins = self.weights.shape[1]
         full = np.zeros((waveforms.shape[0], self.length * self.upsampling), dtype=np.complex64)
         full[:, :bins] = spectrum[:, :bins] * self.weights
@@ -152,7 +156,7 @@ def matched_filter(
     The weighted matched filter is the Wiener inverse filter, tapered over the band to keep side lobes low.
     """
     require_shape("templates", templates, (None, None))
-    length = fft.next_fast_len(samples + templates.shape[1], real=True)
+    length = _fast_length(samples + templates.shape[1])
     frequency_hz = np.fft.rfftfreq(length, 1.0 / sample_rate_hz)
     spectrum = np.asarray(fft.rfft(templates.astype(np.float64), length, axis=1))
     power = np.abs(spectrum) ** 2

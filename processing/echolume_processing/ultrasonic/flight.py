@@ -79,7 +79,7 @@ def first_arrivals(
     magnitude = np.abs(compressed)
     receivers, samples = magnitude.shape
     first, last = max(1, gate[0]), min(samples - 1, gate[1])
-    relative = magnitude / threshold
+    relative = np.asarray(magnitude / threshold, dtype=np.float32)
     noise = noise_level(magnitude[:, first:last])
     time_s, amplitude, phase, sigma = (np.full(receivers, np.nan) for _ in range(4))
     count = np.zeros(receivers, dtype=np.uint8)

@@ -8,7 +8,7 @@ from typing import Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from echolume_messages.geometry import Points3, require_shape
 
@@ -30,7 +30,7 @@ class Raster:
         """x and y of every pixel, (rows, columns, 2)."""
         x = self.x0_mm + self.pixel_mm * np.arange(self.columns)
         y = self.y0_mm + self.pixel_mm * np.arange(self.rows)
-        return np.stack(np.meshgrid(x, y), axis=-1)
+        return np.stack(np.meshgrid(x, y), axis=-1).astype(np.float64)
 
 
 def raster_over(points_mm: Points3, pixel_mm: float) -> Raster:
@@ -49,7 +49,7 @@ def interpolate_nearest(points_mm: Points3, raster: Raster) -> DepthMap:
     The paper, figure 9.
     """
     require_shape("points_mm", points_mm, (None, 3))
-    _, nearest = cKDTree(points_mm[:, :2]).query(raster.centres().reshape(-1, 2))
+    _, nearest = KDTree(points_mm[:, :2]).query(raster.centres().reshape(-1, 2))
     return points_mm[nearest, 2].reshape(raster.rows, raster.columns)
 
 

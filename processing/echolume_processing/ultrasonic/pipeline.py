@@ -25,8 +25,8 @@ MIN_PATH_MM = 110.0
 """Shorter paths drown in the cross-talk and its ringing."""
 MAX_PATH_MM = 900.0
 SURFACE = 0.45
-"""Share of a wide plate's amplitude at the same distance that makes an echo a surface's: half at a straight edge, a little less to
-keep bars narrower than the Fresnel zone."""
+"""Share of a wide plate's amplitude at the same distance that makes an echo a surface's: half at a straight edge, a
+little less to keep bars narrower than the Fresnel zone."""
 PATH_FLOOR_MM = 0.05
 """What the model leaves unexplained of a path on a clean plane."""
 UPSAMPLING = 4

@@ -40,7 +40,7 @@ class BlockPredictor:
         self._area_mm2 = np.concatenate([area_mm2, -area_mm2])
         self._samples = samples
         self._rate_hz = found.sample_rate_hz
-        self._length = fft.next_fast_len(samples + len(found.templates[0]), real=True)
+        self._length = int(fft.next_fast_len(samples + len(found.templates[0]), real=True) or 0)
         self._frequency_hz = np.fft.rfftfreq(self._length, 1 / self._rate_hz)
         spectrum = np.asarray(fft.rfft(np.array(found.templates), self._length, axis=1))
         origin_s = found.template_origin / self._rate_hz
@@ -107,7 +107,7 @@ class BlockPredictor:
             at = ((there + back) / speed - start_s) * rate
             whole = at.astype(np.int64)
             part = at - whole
-            row = np.bincount(whole, weight * (1 - part), bins)[:bins]
+            row = np.asarray(np.bincount(whole, weight * (1 - part), bins), dtype=np.float64)[:bins]
             rows.append(row + np.bincount(whole + 1, weight * part, bins)[:bins])
         spectrum = np.asarray(fft.rfft(np.array(rows), axis=1))[:, : len(self._frequency_hz)]
-        return spectrum * (2j * np.pi * self._frequency_hz)
+        return np.asarray(spectrum * (2j * np.pi * self._frequency_hz), dtype=np.complex128)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
+from scipy.signal.windows import tukey
 
 from echolume_messages.errors import CalibrationRejectedError
 from echolume_messages.geometry import robot_from_flange
@@ -92,5 +93,5 @@ def cut_templates(
     margin = round(30e-6 * rate_hz)
     start = max(0, (low + int(quiet_before[-1]) if quiet_before.size else low) - margin)
     stop = min(passed.shape[1], (after + int(quiet_after[0]) if quiet_after.size else high) + margin)
-    cut = passed[:, start:stop] * signal.windows.tukey(stop - start, 2 * margin / (stop - start))
+    cut = passed[:, start:stop] * tukey(stop - start, 2 * margin / (stop - start))
     return Templates(np.asarray(cut, dtype=np.float32), start, peaks.astype(np.float64), chosen)

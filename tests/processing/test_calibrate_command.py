@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
+from echolume_messages import calibration as calibration_file
 from echolume_messages.archive_format import CHANNEL_BY_NAME, encode_message
 from echolume_messages.errors import ArchiveError, CalibrationMissingError, CalibrationRejectedError, ConfigError
 from echolume_processing.commands import calibrate
 from processing.calibration_scan import calibration_records
+from processing.test_optical_subscriber import calibration as some_calibration
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get("ECHOLUME_DATA", "") or ROOT.parent / "shared" / "data")
@@ -78,6 +80,17 @@ def test_the_laser_is_calibrated_from_an_archive(archive: Path, capsys: pytest.C
     assert figures["laser"]["normal"][0] > 0.999
     assert run("laser", str(archive)) == 0
     assert "laser plane" in capsys.readouterr().out
+
+
+def test_a_calibration_file_gets_new_optical_parts_and_keeps_its_array(archive: Path, tmp_path: Path) -> None:
+    path = tmp_path / "calibration.json"
+    before = some_calibration("test")
+    calibration_file.save(before, path)
+    assert run("laser", str(archive), "--into", str(path)) == 0
+    after = calibration_file.load(path, "test")
+    assert after.array == before.array
+    assert after.laser != before.laser
+    assert after.digest != before.digest
 
 
 def test_a_missing_calibration_to_update_is_noticed_before_the_work(archive: Path, tmp_path: Path) -> None:

@@ -5,13 +5,21 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import TypeAlias, cast
 
 from echolume_daemon.ledger import Expected, Ledger
 from echolume_messages.bus import Bus
-from echolume_messages.errors import ArchiveError, DeviceAbsentError, EcholumeError, NoReplyError, ScanError
+from echolume_messages.errors import (
+    ArchiveError,
+    DeviceAbsentError,
+    DeviceSilentError,
+    EcholumeError,
+    NoReplyError,
+    ScanError,
+)
 from echolume_messages.plan import Step
 from echolume_messages.rig import Rig
 from echolume_messages.topics import CAMERA_LEFT, CAMERA_RIGHT, ECHOES, PASS_STREAMS
@@ -23,9 +31,11 @@ SERVICES_OF = {"snap": ("cameras",), "optical": ("guide", "cameras"), "ultrasoni
 HELD_SHARE = 0.8
 """Unacknowledged records may fill this share of the journal; then the next trigger waits."""
 HELD_LIMIT_S = 15.0
+RECORDER_S = 2.0
 READY_S = 8.0
 DRAIN_S = 8.0
 ERRORS_IN_A_ROW = 3
+LOST_IN_A_ROW = 6
 _log = logging.getLogger("echolume.acquisition")
 
 
@@ -52,10 +62,12 @@ class Acquisition:
     changed: threading.Condition = field(default_factory=threading.Condition)
     durable_seq: dict[str, int] = field(default_factory=dict[str, int])
     _fired_s: dict[tuple[int, int], float] = field(default_factory=dict[tuple[int, int], float])
+    _acknowledged: set[tuple[str, int, int, int]] = field(default_factory=set[tuple[str, int, int, int]])
+    _recent: deque[tuple[int, int]] = field(default_factory=lambda: deque[tuple[int, int]](maxlen=8 * LOST_IN_A_ROW))
     _errors: int = 0
-    _revoked: set[Expected] = field(default_factory=set[Expected])
-    _next_ask_s: float = 0.0
+    _asked_s: float = 0.0
     _next_look_s: float = 0.0
+    _recorder_heard_s: float = 0.0
     _recorder_error: str = ""
 
     # -- what the recorder says
@@ -67,8 +79,11 @@ class Acquisition:
         with self.changed:
             self._recorder_error = str(message.get("error") or "") or self._recorder_error
             self.durable_seq.update(cast("dict[str, int]", message.get("durable", {})))
-            for topic, trigger, attempt, _seq in cast("list[tuple[str, int, int, int]]", message.get("records", [])):
-                self.ledger.durable(topic, trigger, attempt)
+            for topic, trigger, attempt, seq in cast("list[tuple[str, int, int, int]]", message.get("records", [])):
+                record = (topic, trigger, attempt, seq)
+                if record not in self._acknowledged:  # a restarted recorder says again what its archive holds
+                    self._acknowledged.add(record)
+                    self.ledger.durable(topic, trigger, attempt)
             self.changed.notify_all()
 
     # -- before the scan, and after a service came back
@@ -116,8 +131,10 @@ class Acquisition:
 
     def run(self, steps: list[Step]) -> None:
         """Acquire steps; each failure only loses its own trigger, unless the device stays away."""
+        self._recent.clear()
         for step in steps:
             self.gate()
+            self._check_streak(step.kind)
             if self._recorder_error:
                 self.watch_recorder()
             self._await_room(step)
@@ -139,9 +156,23 @@ class Acquisition:
                 self._lose(left)
             with self.changed:
                 self.changed.wait(0.05)
-        self._ask_for_missing(at_once=True)
+        self._ask_for_missing(0.0)
         with self.changed:
             return self.ledger.missing(pass_name)
+
+    def _check_streak(self, kind: str) -> None:
+        """A device that takes its triggers and delivers nothing, time after time, is not worth waiting for."""
+        if kind != "ultrasonic":
+            self._ask_for_missing(1.0)
+        for topic in PASS_STREAMS[kind]:
+            with self.changed:
+                waiting = self.ledger.open
+                known = [fired for fired in self._recent if Expected(topic.name, *fired) not in waiting]
+                silent = all(topic.name in self.ledger.lost_streams(*fired) for fired in known[-LOST_IN_A_ROW:])
+            if silent and len(known) >= LOST_IN_A_ROW:
+                raise DeviceSilentError(
+                    f"{topic.name}: nothing came for the last {LOST_IN_A_ROW} triggers; is the device hung?"
+                )
 
     def watch_recorder(self) -> None:
         """Fail as soon as the recorder's disk does; have a restarted recorder go on with the archive.
@@ -159,6 +190,7 @@ class Acquisition:
         self._next_look_s = now_s + 1.0
         try:
             archives = cast("Json", self._ask("recorder", "status", {}, 2.0).get("archives", {}))
+            self._recorder_heard_s = time.monotonic()
             if self.scan not in archives:
                 _log.warning("the recorder was restarted; it goes on with the archive of %s", self.scan)
                 self.reopen()
@@ -178,6 +210,7 @@ class Acquisition:
             attempt = self.ledger.next_attempt(step.trigger)
             self.ledger.fired(step.trigger, attempt)
             self._fired_s[step.trigger, attempt] = time.monotonic()
+            self._recent.append((step.trigger, attempt))
         try:
             if step.kind == "ultrasonic":
                 self._ping(step, attempt)
@@ -235,15 +268,19 @@ class Acquisition:
         """Hold the trigger while what is not yet acknowledged fills most of the journal."""
         needed = sum(self._bytes(t.name) for t in PASS_STREAMS[step.kind])
         limit = HELD_SHARE * self.rig.bus.journal_mib * 2**20
+        journal_s = self.rig.bus.journal_s
         deadline_s = time.monotonic() + HELD_LIMIT_S
         while waiting := self._open():
             held = sum(self._bytes(e.topic) for e in waiting)
             now_s = time.monotonic()
-            age_s = max(now_s - self._fired_s.get((e.trigger, e.attempt), now_s) for e in waiting)
-            if held + needed <= limit and age_s <= HELD_SHARE * self.rig.bus.journal_s:
+            ages_s = {e: now_s - self._fired_s.get((e.trigger, e.attempt), now_s) for e in waiting}
+            if held + needed <= limit and max(ages_s.values()) <= HELD_SHARE * journal_s:
                 return
             self._ask_for_missing()
             self.watch_recorder()
+            if now_s - self._recorder_heard_s < RECORDER_S:
+                # it listens, and no journal holds these any more: they can only be acquired again
+                self._lose(e for e, age_s in ages_s.items() if age_s > journal_s + RECORDER_S)
             if now_s > deadline_s:
                 raise ScanError(
                     f"recorder: acknowledged nothing of {_named(waiting)} for {HELD_LIMIT_S:.0f} s; is it running, "
@@ -271,12 +308,12 @@ class Acquisition:
             for topic, trigger, attempt in records:
                 self.ledger.lost(topic, trigger, attempt)
 
-    def _ask_for_missing(self, *, at_once: bool = False) -> None:
-        """Learn from the cameras which frames will not come; at most five times a second."""
+    def _ask_for_missing(self, period_s: float = 0.2) -> None:
+        """Learn from the cameras which frames will not come, if that is `period_s` ago."""
         now_s = time.monotonic()
-        if now_s < self._next_ask_s and not at_once:
+        if now_s < self._asked_s + period_s:
             return
-        self._next_ask_s = now_s + 0.2
+        self._asked_s = now_s
         if not any(step.kind != "ultrasonic" for step in self.ledger.steps):
             return
         try:

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import TypeAlias, cast
 
 from echolume_messages.bus import Bus, Message
-from echolume_messages.errors import EcholumeError, NoReplyError
+from echolume_messages.errors import EcholumeError, NoReplyError, WrongStateError
 from echolume_messages.topics import LEDGER, RUN_STATE
 
 Json: TypeAlias = dict[str, object]
@@ -135,10 +135,14 @@ class ScanClient:
             for state in states:
                 if ledger is not None and state.get("state") == "idle":
                     return ledger
-                self._show(state, on_state, on_prompt)
+                self._show(state, on_state, on_prompt, stop)
 
     def _show(
-        self, state: Json, on_state: Callable[[Json], None] | None, on_prompt: Callable[[str], object] | None
+        self,
+        state: Json,
+        on_state: Callable[[Json], None] | None,
+        on_prompt: Callable[[str], object] | None,
+        stop: threading.Event | None,
     ) -> None:
         if on_state is not None:
             on_state(state)
@@ -148,7 +152,12 @@ class ScanClient:
             return
         on_prompt(prompt)
         self._answered = revision
-        self.command("resume")
+        if stop is not None and stop.is_set():
+            return
+        try:
+            self.command("resume")
+        except WrongStateError:
+            return  # somebody else has answered meanwhile
 
     def _final(self, message: Message) -> Json | None:
         if message.topic is not LEDGER:

@@ -148,6 +148,10 @@ class Ledger:
         """Steps of a pass that are not matched, in the order of acquisition."""
         return [s for s in self.steps if s.pass_name == pass_name and s.trigger not in self._matched]
 
+    def lost_streams(self, trigger: int, attempt: int) -> set[str]:
+        """Streams of one firing that did not come."""
+        return {e.topic for e in self._expected(trigger, attempt) if e in self._lost}
+
     def next_attempt(self, trigger: int) -> int:
         """Number of the next attempt at a trigger."""
         return max((a for t, a in self._fired if t == trigger), default=-1) + 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import queue
+import secrets
 import socket
 import threading
 import time
@@ -253,7 +254,7 @@ class FakeRecorder:
     """Acknowledges what it receives, except what `deaf` names as (topic, trigger, attempt)."""
 
     def __init__(self, bus: Bus) -> None:
-        self.bus, self.deaf, self.scan = bus, set(), ""
+        self.bus, self.deaf, self.scan, self.echo = bus, set(), "", False
         self.opened: list[dict] = []
         self.closed: list[str] = []
         self.kept: list[tuple[str, int, int]] = []
@@ -288,14 +289,13 @@ class FakeRecorder:
                 continue
             self.kept.append(key)
             self.frames[key] = message.payload
-            self._durable.put_json(
-                {
-                    "scan": header.scan,
-                    "durable": {header.stream: header.seq},
-                    "records": [[*key, header.seq]],
-                    "count": len(self.kept),
-                }
-            )
+            told = {"scan": header.scan, "durable": {header.stream: header.seq}, "records": [[*key, header.seq]]}
+            for _ in range(1 + self.echo):
+                self.tell(told | {"count": len(self.kept)})
+
+    def tell(self, what: dict) -> None:
+        """Publish a ``recorder/durable``."""
+        self._durable.put_json(what)
 
     def close(self) -> None:
         self._stop.set()
@@ -303,10 +303,12 @@ class FakeRecorder:
 
 
 class Bench:
-    """Router, services with fake devices, fake recorder, and a bus for the test."""
+    """Router (or somebody else's), services with fake devices, fake recorder, and a bus for the test."""
 
-    def __init__(self, directory: Path) -> None:
-        self.rig = make_rig(free_endpoint(), directory)
+    def __init__(self, directory: Path, endpoint: str = "") -> None:
+        self._own_router = not endpoint
+        self.rig = make_rig(endpoint or free_endpoint(), directory)
+        self.rig.name = f"bench-{secrets.token_hex(4)}"
         self.left, self.right = FakeCamera(), FakeCamera(first_id=7)
         self.trigger = FakeTrigger([self.left, self.right])
         self.guide, self.robot, self.array = FakeGuide(self.trigger), FakeRobot(), FakeArray()
@@ -316,7 +318,8 @@ class Bench:
         self.codes: dict[str, int] = {}
 
     def __enter__(self) -> Bench:
-        self._router.enter_context(open_router(self.rig.bus.endpoint))
+        if self._own_router:
+            self._router.enter_context(open_router(self.rig.bus.endpoint))
         self.bus = connect(self.rig.bus.endpoint, self.rig.name)
         self.recorder_bus = connect(self.rig.bus.endpoint, self.rig.name)
         self.recorder = FakeRecorder(self.recorder_bus)

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from daemon.bench import Bench, wait_until
+from daemon.bench import Bench, free_endpoint, wait_until
 from echolume_daemon.client import ScanClient
+from echolume_messages.bus.router import open_router
 from echolume_messages.errors import (
     CalibrationMissingError,
     ConfigError,
@@ -39,9 +40,16 @@ height_mm = 150.0
 PLAN = f'name = "small"\n{LIGHT}{SOUND}'
 
 
+@pytest.fixture(scope="module")
+def router() -> Iterator[str]:
+    endpoint = free_endpoint()
+    with open_router(endpoint):
+        yield endpoint
+
+
 @pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Bench]:
-    with Bench(tmp_path) as made:
+def bench(tmp_path: Path, router: str) -> Iterator[Bench]:
+    with Bench(tmp_path, router) as made:
         yield made
 
 
@@ -236,3 +244,38 @@ def test_stopping_the_services_in_mid_scan_ends_them_all_with_code_0(bench: Benc
     bench.stop()
     assert bench.codes == dict.fromkeys(("guide", "cameras", "robot", "array", "conductor"), 0)
     assert not bench.guide.laser
+
+
+def test_a_camera_that_delivers_nothing_any_more_ends_the_scan(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("echolume_daemon.cameras.FRAME_TIMEOUT_S", 0.1)
+    bench.left.drop = set(range(4, 1000))
+    bench.start()
+    client = ScanClient(bench.bus, "ann@lab")
+    client.start(f'name = "long"\n{LIGHT.replace("4.0", "400.0")}')
+    ledger = client.wait()
+    assert ledger["outcome"] == "failed"
+    assert "cameras/left: nothing came for the last" in client.status()["error"]
+    assert len(bench.guide.exposed) < 100
+    assert ledger["passes"]["light"]["matched"] == 3
+
+
+def test_a_failing_disk_ends_the_scan_with_the_recorders_words(bench: Bench) -> None:
+    reached = threading.Event()
+    bench.guide.on_expose = lambda x_mm: reached.set() if x_mm >= 0 else None
+    bench.start()
+    client = ScanClient(bench.bus, "ann@lab")
+    scan = client.start(f'name = "long"\n{LIGHT.replace("4.0", "400.0")}')
+    assert reached.wait(10.0)
+    bench.recorder.tell({"scan": scan, "durable": {}, "records": [], "count": 0, "error": "raw.mcap: disk full"})
+    assert client.wait()["outcome"] == "failed"
+    assert client.status()["error"] == "recorder: raw.mcap: disk full"
+
+
+def test_what_a_restarted_recorder_says_again_is_no_duplicate(bench: Bench) -> None:
+    bench.start("robot", "array", "conductor")
+    bench.recorder.echo = True
+    client = ScanClient(bench.bus, "ann@lab")
+    client.start(f'name = "small"\n{SOUND}')
+    ledger = client.wait()
+    assert ledger["passes"]["sound"]["duplicate"] == 0
+    assert ledger["acknowledged"] == 6

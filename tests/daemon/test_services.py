@@ -14,19 +14,27 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from daemon.bench import Bench, make_rig, wait_until
+from daemon.bench import Bench, free_endpoint, make_rig, wait_until
 from echolume_daemon import guide
 from echolume_daemon.body import flag, number, pose6, text, whole
 from echolume_daemon.notify import notify, watchdog_period_s
 from echolume_daemon.service import Loop, Service, run_service
 from echolume_messages.bus import connect
+from echolume_messages.bus.router import open_router
 from echolume_messages.errors import ConfigError, DeviceAbsentError
 from echolume_messages.topics import SERVICES, health
 
 
+@pytest.fixture(scope="module")
+def router() -> Iterator[str]:
+    endpoint = free_endpoint()
+    with open_router(endpoint):
+        yield endpoint
+
+
 @pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Bench]:
-    with Bench(tmp_path) as made:
+def bench(tmp_path: Path, router: str) -> Iterator[Bench]:
+    with Bench(tmp_path, router) as made:
         yield made
 
 
@@ -47,8 +55,8 @@ def to_toml(rig: object) -> str:
     return toml_text(rig)
 
 
-def test_absent_devices_are_a_state_and_named(tmp_path: Path) -> None:
-    with Bench(tmp_path) as bench:
+def test_absent_devices_are_a_state_and_named(tmp_path: Path, router: str) -> None:
+    with Bench(tmp_path, router) as bench:
         bench.guide = bench.robot = bench.array = None  # the real drivers, with nothing on their ports
         bench.start("guide", "robot", "array")
         for name, port in (("guide", "no-guide"), ("robot", "127.0.0.1:1"), ("array", "127.0.0.1:1")):
@@ -77,12 +85,13 @@ def test_the_laser_goes_off_at_start_and_when_the_one_in_charge_vanishes(bench: 
     wait_until(lambda: not bench.guide.laser, "laser off when the recorder is gone", 2.0)
 
 
-def test_the_laser_goes_off_when_the_router_dies(bench: Bench) -> None:
-    bench.start("guide")
-    wait_until(lambda: bench.bus.request("guide", "status")["in_charge"] == ["recorder"], "recorder in charge")
-    bench.guide.laser = True
-    bench.kill_router()
-    wait_until(lambda: not bench.guide.laser, "laser off when the router is gone", 5.0)
+def test_the_laser_goes_off_when_the_router_dies(tmp_path: Path) -> None:
+    with Bench(tmp_path) as bench:
+        bench.start("guide")
+        wait_until(lambda: bench.bus.request("guide", "status")["in_charge"] == ["recorder"], "recorder in charge")
+        bench.guide.laser = True
+        bench.kill_router()
+        wait_until(lambda: not bench.guide.laser, "laser off when the router is gone", 5.0)
 
 
 def test_the_laser_goes_off_at_the_end(bench: Bench) -> None:
@@ -125,10 +134,9 @@ def test_signals_end_services_with_code_0(bench: Bench, tmp_path: Path) -> None:
     assert "Traceback" not in "".join(ends.values())
 
 
-def test_a_router_serves_until_told_to_stop(tmp_path: Path, bench: Bench) -> None:
+def test_a_router_serves_until_told_to_stop(tmp_path: Path) -> None:
     path = tmp_path / "other.toml"
-    rig = make_rig("tcp/127.0.0.1:0", tmp_path)
-    rig.bus.endpoint = bench.rig.bus.endpoint[:-1] + ("1" if bench.rig.bus.endpoint[-1] != "1" else "2")
+    rig = make_rig(free_endpoint(), tmp_path)
     path.write_text(to_toml(rig), encoding="utf-8")
     child = subprocess.Popen([sys.executable, "-m", "echolume", "serve", "router", "--rig", str(path)])
     try:

@@ -85,7 +85,9 @@ def _ask(text: str, stop: threading.Event) -> None:
 
     before = signal.signal(signal.SIGINT, interrupt)
     try:
-        sys.stdin.readline()
+        if not sys.stdin.readline():
+            sys.stderr.write("nobody is there to answer (end of input): the scan is aborted\n")
+            stop.set()
     except KeyboardInterrupt:
         stop.set()
     finally:

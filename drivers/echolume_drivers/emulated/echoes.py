@@ -11,7 +11,7 @@ from scipy.ndimage import maximum_filter
 from echolume_drivers.emulated import transducer
 from echolume_drivers.emulated.array_truth import ArrayTruth
 from echolume_drivers.emulated.facets import Facets, build_facets
-from echolume_drivers.emulated.kirchhoff import accumulate
+from echolume_drivers.emulated.kirchhoff import STRIDE, accumulate
 from echolume_drivers.emulated.scene import Scene
 from echolume_messages.geometry import Matrix, apply, require_shape, rotation_from_vector
 from echolume_messages.rig import ArraySettings
@@ -35,11 +35,12 @@ _KEPT_SURFACES = 4
 
 @dataclass(frozen=True)
 class Surface:
-    """A scene prepared for sound: facets, their random texture, and the terrain grown by `DILATION_MM`."""
+    """A scene prepared for sound: facets, their random texture, and its terrain grown twice."""
 
     scene: Scene
     facets: Facets
     texture: NDArray[np.float64]  # (m,)
+    near: NDArray[np.float64]
     dilated: NDArray[np.float64]
 
 
@@ -50,8 +51,9 @@ def surface_of(scene: Scene) -> Surface:
         return found
     facets = build_facets(scene)
     texture = SCATTER_MM * np.random.default_rng(len(facets.kind)).normal(size=len(facets.kind))
-    grown = maximum_filter(scene.front_mm, size=2 * round(DILATION_MM / scene.cell_mm) + 1)
-    found = Surface(scene, facets, texture, grown)
+    grown = maximum_filter(scene.front_mm, size=2 * round(DILATION_MM / scene.cell_mm) + 1, mode="constant")
+    near = maximum_filter(scene.front_mm, size=2 * STRIDE + 1, mode="constant")
+    found = Surface(scene, facets, texture, near, grown)
     while len(_surfaces) >= _KEPT_SURFACES:
         _surfaces.pop(next(iter(_surfaces)))
     _surfaces[id(scene)] = found
@@ -106,7 +108,7 @@ def echo_waveforms(
     height_mm = max(float(rig_from_array[2, 3]), 1.0)
     accumulate(
         facets.centre_mm, facets.kind, facets.sign, facets.size_mm, facets.floor_mm, surface.texture,
-        scene.front_mm, surface.dilated, np.array([scene.x0_mm, scene.y0_mm]), scene.cell_mm,
+        scene.front_mm, surface.near, surface.dilated, np.array([scene.x0_mm, scene.y0_mm]), scene.cell_mm,
         apply(rig_from_array, elements), rig_from_array[:3, 2].copy(),
         transducer.directivity_table(bands_hz, truth.radius_mm, speed_mps),
         2 * np.pi * bands_hz / (speed_mps * 1e3), truth.radius_mm,

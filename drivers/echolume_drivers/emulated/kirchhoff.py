@@ -19,6 +19,8 @@ WAY, COSINE, LIT, ALONG_U, ALONG_V, SPREAD, BEAM = range(7)
 """How an element sees a facet: distance, cosine, visible share, direction in the facet, longer way, BANDS of beam."""
 OBSTACLE_MM = 0.3
 """An obstacle must rise this far above a facet to count."""
+STRIDE = 5
+"""Cells that a ray steps over where all is low."""
 DARK = -3.0
 """Hidden by so many Fresnel radii, a facet adds nothing."""
 
@@ -32,6 +34,7 @@ def _ground(heights: NDArray[np.float64], x0: float, y0: float, cell: float, x: 
 @njit(cache=True, fastmath={"reassoc", "contract", "arcp", "nsz"})
 def clearance(
     heights: NDArray[np.float64],
+    near: NDArray[np.float64],
     x0: float,
     y0: float,
     cell: float,
@@ -44,7 +47,10 @@ def clearance(
     qz: float,
     wavelength: float,
 ) -> float:
-    """Least clearance of the ray from p up to q over higher terrain, in first-Fresnel radii; negative: hidden."""
+    """Least clearance of the ray from p up to q over higher terrain, in first-Fresnel radii; negative: hidden.
+
+    `near` is the highest terrain within `STRIDE` cells: where it is low, the ray steps so far at once.
+    """
     dx, dy, dz = qx - px, qy - py, qz - pz
     lateral = math.sqrt(dx * dx + dy * dy)
     if dz <= 0 or lateral < 0.5 * cell:
@@ -52,9 +58,15 @@ def clearance(
     length = math.sqrt(lateral * lateral + dz * dz)
     least = 9.0
     steps = int(min(1.0, (top + 4.0 - pz) / dz) * lateral / cell)
-    for k in range(1, steps + 1):
+    k = 1
+    while k <= steps:
         t = k * cell / lateral
-        ground = _ground(heights, x0, y0, cell, px + t * dx, py + t * dy)
+        x, y = px + t * dx, py + t * dy
+        if _ground(near, x0, y0, cell, x, y) <= pz + OBSTACLE_MM:
+            k += STRIDE
+            continue
+        k += 1
+        ground = _ground(heights, x0, y0, cell, x, y)
         if ground > pz + OBSTACLE_MM:
             above = (pz + t * dz - ground) * lateral / length
             radius = math.sqrt(wavelength * length * max(t * (1 - t), 1e-3))
@@ -202,6 +214,7 @@ def accumulate(
     floor: NDArray[np.float64],
     texture: NDArray[np.float64],
     heights: NDArray[np.float64],
+    near: NDArray[np.float64],
     dilated: NDArray[np.float64],
     origin: NDArray[np.float64],
     cell: float,
@@ -245,12 +258,12 @@ def accumulate(
         open_sky = (
             not wall
             and _ground(dilated, x0, y0, cell, px, py) < pz + OBSTACLE_MM
-            and clearance(dilated, x0, y0, cell, top, px, py, pz, ex, ey, ez, wavelength) > 4.0
+            and clearance(dilated, dilated, x0, y0, cell, top, px, py, pz, ex, ey, ez, wavelength) > 4.0
         )
         for e in range(elements.shape[0]):
             if direct[e, LIT] > 0 and not open_sky:
                 qx, qy, qz = elements[e, 0], elements[e, 1], elements[e, 2]
-                direct[e, LIT] = soft(clearance(heights, x0, y0, cell, top, mx, my, pz, qx, qy, qz, wavelength))
+                direct[e, LIT] = soft(clearance(heights, near, x0, y0, cell, top, mx, my, pz, qx, qy, qz, wavelength))
             if direct[0, LIT] <= 0:
                 break
         if direct[0, LIT] <= 0:

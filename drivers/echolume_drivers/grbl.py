@@ -7,7 +7,8 @@ Every laser-on is queued together with its own laser-off: an exposure is one pro
 that fits the board's receive buffer and goes out in one write, so the board has all of it or none. In laser mode
 stock Grbl lights M3 at rest only while the modal motion is G1; hence the move is always sent, even one of no length.
 A board that stays silent is reset at once (0x18 switches the laser off); one that answers wrongly or raises an alarm
-is braked first, so that it keeps its position; then the error is raised. Real rigs need a dead-man relay on laser-enable: stock Grbl has none.
+is braked first, so that it keeps its position; then the error is raised. Real rigs need a dead-man relay on
+laser-enable: stock Grbl has none.
 """
 
 from __future__ import annotations
@@ -148,6 +149,11 @@ class GrblGuide:
 
     def status(self) -> GuideStatus:
         """Ask the board where it is; the position is not that of an encoder while it moves."""
+        if self._turn.acquire(blocking=False):
+            try:
+                self._leave_alarm()
+            finally:
+                self._turn.release()
         report = self._link.report()
         x_mm = report.machine_mm + self._settings.x_home_mm
         return GuideStatus(report.state, x_mm, self._link.alarm if report.state == "Alarm" else None)
@@ -167,6 +173,7 @@ class GrblGuide:
         low_mm, high_mm = self._settings.min_mm, self._settings.max_mm
         if not (math.isfinite(x_mm) and low_mm <= x_mm <= high_mm):
             raise DeviceFaultError(f"{self._link.where}: x {x_mm} mm is outside {low_mm}..{high_mm} mm")
+        self._leave_alarm()
         alarm = self._link.alarm
         if alarm is not None and alarm in LOSES_POSITION:
             raise DeviceFaultError(f"{self._link.where}: {alarm_words(alarm)}")
@@ -174,6 +181,11 @@ class GrblGuide:
             raise DeviceFaultError(f"{self._link.where}: not homed: home the guide first")
         machine_mm = x_mm - self._settings.x_home_mm
         return round(machine_mm * self._steps_per_mm) / self._steps_per_mm + self._settings.x_home_mm
+
+    def _leave_alarm(self) -> None:
+        """After a limit alarm the board answers nothing but a reset."""
+        if self._link.alarm is not None and self._link.is_troubled:
+            self._reset()
 
     def _go(self, x_mm: float) -> str:
         return f"G53G1X{x_mm - self._settings.x_home_mm:.3f}F{self._settings.feed_mm_per_min:.0f}"

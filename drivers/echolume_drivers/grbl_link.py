@@ -102,6 +102,11 @@ class GrblLink:
         """Whether the port is open."""
         return self._serial is not None
 
+    @property
+    def is_troubled(self) -> bool:
+        """Whether something went wrong since the last reset."""
+        return self._trouble is not None
+
     # --- reading ---------------------------------------------------------------------------------------------
 
     def _read(self, port: serial.Serial) -> None:

@@ -180,9 +180,7 @@ def test_robot_is_stopped_in_the_air(stage: Stage, tmp_path: Path) -> None:
             assert time.monotonic() < deadline_s
         rig = tmp_path / "rig.toml"
         rig.write_text(f'[robot]\nhost = "{host}"\nport = {port}\n')
-        begin_s = time.monotonic()
         assert safe("robot", "--rig", str(rig)) == (0, "safe robot: 6 axes stopped\n")
-        print("took", time.monotonic() - begin_s)
         assert all(axis.state is not State.OPERATION_ENABLED for axis in peer.axes)
         assert stage.robot_pose()[0] < 290
     finally:

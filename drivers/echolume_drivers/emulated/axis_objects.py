@@ -59,6 +59,7 @@ OUT_OF_RANGE: Final = 0x06090030
 BAD_COMMAND: Final = 0x05040001
 NOT_NOW: Final = 0x08000022
 """Data cannot be stored because of the present device state."""
+NOT_MAPPABLE: Final = 0x06040041
 
 
 class SdoAbort(Exception):
@@ -111,6 +112,10 @@ class ObjectDictionary:
             link = self.values[index - 0x200, 1]
             if not link & 0x8000_0000:
                 raise SdoAbort(NOT_NOW)  # a mapping changes only while its PDO is switched off
+            if sub and not _mappable(value):
+                raise SdoAbort(NOT_MAPPABLE)
+            if not sub and value > 2:
+                raise SdoAbort(OUT_OF_RANGE)
         if index == 0x6060 and value not in (0, 1, 6, 8):
             raise SdoAbort(OUT_OF_RANGE)
 
@@ -145,3 +150,8 @@ class ObjectDictionary:
         head = self._toggle << 4 | (7 - len(part)) << 1 | (0 if self._segments else 1)
         self._toggle ^= 1
         return bytes([head]) + part.ljust(7, b"\0")
+
+
+def _mappable(entry: int) -> bool:
+    layout = OBJECTS.get((entry >> 16, entry >> 8 & 0xFF))
+    return layout is not None and struct.calcsize("<" + layout[0]) * 8 == entry & 0xFF

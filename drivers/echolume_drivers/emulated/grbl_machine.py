@@ -16,9 +16,8 @@ from typing import Final
 
 from echolume_drivers.emulated.grbl_parser import LINE_LIMIT, Block, GrblError, parse, strip
 from echolume_drivers.emulated.grbl_planner import DEPTH, Move, Planner
+from echolume_drivers.emulated.grbl_settings import DEFAULTS, change, listing
 
-SOFT_HALF_MM: Final = 155.0
-"""Travel that the controller allows, to either side of the guide's middle."""
 SWITCH_MM: Final = 156.0
 """Where the limit switches are, to either side of the guide's middle."""
 LOST_MM: Final = 0.2
@@ -35,13 +34,12 @@ class GrblMachine:
 
     def __init__(self, speed: float, x_home_mm: float, start_x_mm: float) -> None:
         self.changed = threading.Condition()
-        self.settings: dict[int, float] = {
-            10: 1, 13: 0, 20: 1, 21: 1, 22: 1, 23: 0, 24: 100.0, 25: 6000.0, 26: 25, 27: 6.0,
-            30: 1000, 31: 0, 32: 1, 100: 250.0, 110: 30000.0, 120: 4000.0, 130: 2 * SOFT_HALF_MM,
-        }  # fmt: skip
+        self.settings = dict(DEFAULTS)
         self.planner = Planner(self.settings[120], speed)
         self.alarm: int | None = None
         self.homing_fails: int | None = None
+        self.pending_says: list[str] | None = None
+        """What an alarm raised inside a line wants to say."""
         self._speed = speed
         self._x_home_mm = x_home_mm
         self._offset_mm = start_x_mm
@@ -96,13 +94,7 @@ class GrblMachine:
     def _limit_hit_s(self, now_s: float) -> float | None:
         if not self.settings[21] or self._homing:
             return None
-        for leg in self.planner.legs(now_s):
-            for switch_mm in (-SWITCH_MM, SWITCH_MM):
-                if (leg.move.end_mm + self._offset_mm - switch_mm) * switch_mm >= 0:
-                    at_s = leg.profile.time_at(switch_mm - self._offset_mm)
-                    if at_s is not None:
-                        return leg.start_s + at_s / self._speed
-        return None
+        return self.planner.leaves_s(-SWITCH_MM - self._offset_mm, SWITCH_MM - self._offset_mm, now_s)
 
     # --- real-time commands ----------------------------------------------------------------------------------
 
@@ -300,7 +292,8 @@ class GrblMachine:
         self._spindle = self._spindle if block.spindle is None else block.spindle
 
     def _set_work(self, block: Block, unit_mm: float) -> None:
-        assert block.x is not None
+        if block.x is None:  # the other axes' offsets do not matter here
+            return
         if block.once == 10 and block.l_value == 2:
             self._work_mm = block.x * unit_mm
         else:
@@ -320,6 +313,7 @@ class GrblMachine:
         feed = self.settings[110] if rapid else min(self._feed_mm_per_min, self.settings[110])
         if self._beyond(target_mm):
             self._soft_alarm(generation)
+        self._jogging = False
         self._queue(target_mm, feed, rapid, generation)
 
     def _queue(self, target_mm: float, feed_mm_per_min: float, rapid: bool, generation: int) -> None:
@@ -336,9 +330,6 @@ class GrblMachine:
         self._wait_motion(generation)
         self.pending_says = self._crash(2, time.monotonic())
         raise ResetDuringLine
-
-    pending_says: list[str] | None = None
-    """What an alarm raised inside a line wants to say."""
 
     # --- $ commands ------------------------------------------------------------------------------------------
 
@@ -359,8 +350,7 @@ class GrblMachine:
         if text == "$":
             return ["[HLP:$$ $# $G $I $N $x=val $Nx=line $J=line $SLP $C $X $H ~ ! ? ctrl-x]"]
         if text == "$$":
-            return [f"${key}={value:.3f}" if value % 1 else f"${key}={value:.0f}" for key, value in
-                    sorted(self.settings.items())]  # fmt: skip
+            return listing(self.settings)
         if text == "$I":
             return ["[VER:1.1h.20190825:echolume-emulated]", "[OPT:V,15,128]"]
         if text == "$#":
@@ -369,21 +359,7 @@ class GrblMachine:
             units, distance = (20 if self._inches else 21), (90 if self._absolute else 91)
             modes = f"G{self._motion} G54 G17 G{units} G{distance} G94 M{self._spindle} M9 T0"
             return [f"[GC:{modes} F{self._feed_mm_per_min:.0f} S{self._power:.0f}]"]
-        return self._set(text)
-
-    def _set(self, text: str) -> list[str]:
-        key, equals, value = text[1:].partition("=")
-        if not equals or not key.isdigit() or int(key) not in self.settings:
-            raise GrblError(3)
-        try:
-            number = float(value)
-        except ValueError:
-            raise GrblError(2) from None
-        if number < 0:
-            raise GrblError(4)
-        if int(key) == 20 and number and not self.settings[22]:
-            raise GrblError(10)
-        self.settings[int(key)] = number
+        change(text, self.settings)
         return []
 
     def _jog(self, text: str, generation: int) -> list[str]:

@@ -58,7 +58,7 @@ class GrblPeer:
         self._laser = threading.RLock()
         self._faults: dict[str, list[float]] = {name: [] for name in _REPLY_FAULTS}
         self._last_byte_s = 0.0
-        self._hung = self._tripped = False
+        self._hung = self._tripped = self._eof = False
         self._stopping = False
         self._threads = [
             threading.Thread(target=self._listen, name="grbl-port", daemon=True),
@@ -89,11 +89,8 @@ class GrblPeer:
             if thread.is_alive():
                 thread.join(5.0)
         self._stage.switch_laser(False)
-        with self._out:
-            os.close(self._wake)
-            if self._master >= 0:
-                os.close(self._master)
-                self._master = -1
+        os.close(self._wake)
+        self._hang_up()
 
     def inject(self, fault: str, *, count: int = 1, delay_s: float = 0.3, code: int = 1) -> None:
         """Make something go wrong; see the module's list."""
@@ -108,9 +105,7 @@ class GrblPeer:
         elif fault == "hang":
             self._hung = True
         elif fault == "eof":
-            with self._out:
-                os.close(self._master)
-                self._master = -1
+            self._eof = True
         else:
             raise ValueError(f"GrblPeer: unknown fault {fault!r}")
         self._refresh()
@@ -124,7 +119,9 @@ class GrblPeer:
     def _listen(self) -> None:
         present = False
         boot_s: float | None = None
-        while not self._stopping and self._master >= 0:
+        while not self._stopping:
+            if self._eof:
+                self._hang_up()
             events = self._poll(boot_s, present)
             self._say(self.machine.poll(time.monotonic()))
             if events & select.POLLIN:
@@ -150,12 +147,19 @@ class GrblPeer:
         wait_s = min((max(0.0, at_s - now_s) for at_s in due if at_s is not None), default=1.0)
         poller = select.poll()
         poller.register(self._wake, select.POLLIN)
-        poller.register(self._master, select.POLLIN)
+        if self._master >= 0:
+            poller.register(self._master, select.POLLIN)
         found = dict(poller.poll(min(wait_s, 1.0) * 1e3 + 0.05))
         if self._wake in found:
             with contextlib.suppress(BlockingIOError):
                 os.eventfd_read(self._wake)
         return found.get(self._master, 0)
+
+    def _hang_up(self) -> None:
+        with self._out:
+            if self._master >= 0:
+                os.close(self._master)
+                self._master = -1
 
     def _receive(self, booting: bool) -> None:
         try:

@@ -72,6 +72,16 @@ class Planner:
         """Legs not finished yet; safe from any thread."""
         return [leg for leg in self._track[1] if now_s < leg.end_s]
 
+    def leaves_s(self, low_mm: float, high_mm: float, now_s: float) -> float | None:
+        """When the axis will pass `low_mm` downwards or `high_mm` upwards; None if it stays between."""
+        for leg in self.legs(now_s):
+            end_mm = leg.move.end_mm
+            if not low_mm < end_mm < high_mm:
+                at_s = leg.profile.time_at(low_mm if end_mm <= low_mm else high_mm)
+                if at_s is not None:
+                    return leg.start_s + at_s / self._speed
+        return None
+
     @property
     def end_s(self) -> float:
         """When the queue will be empty; 0 when it is."""

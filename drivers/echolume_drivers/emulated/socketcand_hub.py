@@ -16,6 +16,8 @@ from dataclasses import dataclass
 from typing import Final
 
 JOIN_S: Final = 0.2
+LONGEST: Final = 4096
+"""Text without an end of message that a client may send before it is thrown out."""
 _SEND = re.compile(r"send ([0-9A-Fa-f]+) ([0-8])((?: +[0-9A-Fa-f]{1,2})*)$")
 
 
@@ -60,7 +62,7 @@ class SocketcandHub:
             data = client.wire.recv(65536)
         except OSError:
             data = b""
-        if not data:
+        if not data or len(client.text) > LONGEST:
             self._drop(client)
             return []
         *parts, client.text = (client.text + data.decode("ascii", "replace")).split(">")

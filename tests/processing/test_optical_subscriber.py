@@ -178,12 +178,3 @@ def test_a_calibration_of_another_rig_is_refused() -> None:
 def test_a_start_that_cannot_be_read_is_named() -> None:
     with pytest.raises(CalibrationMissingError, match="conductor/start seq 3"):
         optical.read_start(start_message(b'{"scan": 5}'), "test")
-
-
-def test_halves_that_never_meet_are_forgotten_and_counted() -> None:
-    pairs = optical.Pairs()
-    header = Header(stream="cameras/left", seq=0, t_ns=0, t_wall_ns=0, boot="b", scan="s")
-    for trigger in range(optical.MAX_HALVES + 5):
-        half = Message(msgspec.structs.replace(header, trigger=trigger), topics.CAMERA_LEFT, np.zeros((2, 2), np.uint8))
-        assert pairs.add(half) is None
-    assert pairs.unpaired == 5

@@ -15,6 +15,7 @@ from echolume_messages import topics
 from echolume_messages.bus import Bus, Message
 from echolume_messages.errors import EcholumeError
 from echolume_messages.rig import Rig
+from echolume_messages.types import Structured
 from echolume_processing.evidence import Evidence, read_start
 from echolume_processing.ping import ping_from_record
 from echolume_processing.session import conclude
@@ -146,9 +147,9 @@ class HybridSubscriber:
         key = (header.trigger, header.attempt)
         kind = scan.kinds.get(header.pass_name)
         if message.topic == topics.OPTICAL_POINTS and kind == "optical":
-            scan.evidence.add_optical(*key, message.payload)
+            scan.evidence.add_optical(*key, cast("Structured", message.payload))
         elif message.topic == topics.ULTRASONIC_POINTS and kind == "ultrasonic":
-            scan.evidence.add_ultrasonic(*key, message.payload)
+            scan.evidence.add_ultrasonic(*key, cast("Structured", message.payload))
         elif message.topic == topics.ECHOES and kind == "ultrasonic":
             scan.evidence.add_ping(*key, ping_from_record(header, np.asarray(message.payload, dtype=np.int16)))
         else:

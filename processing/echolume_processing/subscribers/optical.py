@@ -18,14 +18,15 @@ from echolume_messages.errors import CalibrationMissingError
 from echolume_messages.rig import Rig
 from echolume_processing.optical.pipeline import OpticalPipeline
 from echolume_processing.subscribers.frame import run_subscriber
+from echolume_processing.subscribers.pairing import Pairs
 
-FRAMES_DEPTH = 32
+FRAMES_DEPTH = 24
+"""Frames of each camera that may wait in the queue."""
 HELD_PAIRS = 8
 """Pairs of a scan whose start is not known yet; with more, frames wait in the journals."""
 PATIENCE_S = 15.0
 """How long the start of an unknown scan may take to be refilled before its frames are given up."""
 MAX_SCANS = 8
-MAX_HALVES = 64
 
 log = logging.getLogger("echolume.optical")
 
@@ -78,35 +79,16 @@ def read_start(message: Message, rig: str) -> tuple[str, ScanSetup]:
     return start.scan, ScanSetup(OpticalPipeline(calibration), calibration.digest, optical)
 
 
-class Pairs:
-    """Joins left and right frames by scan, trigger and attempt; forgets the oldest half beyond `MAX_HALVES`."""
-
-    def __init__(self) -> None:
-        self._halves: dict[tuple[str, int, int], Message] = {}
-        self.unpaired = 0
-
-    def add(self, message: Message) -> tuple[Message, Message] | None:
-        """Take a frame; the (left, right) pair if that completes one."""
-        key = message.header.scan, message.header.trigger, message.header.attempt
-        other = self._halves.pop(key, None)
-        if other is None or other.topic == message.topic:
-            self._halves[key] = message
-            if len(self._halves) > MAX_HALVES:
-                del self._halves[next(iter(self._halves))]
-                self.unpaired += 1
-            return None
-        return (message, other) if message.topic == topics.CAMERA_LEFT else (other, message)
-
-
 class OpticalSubscriber:
     """Processes the optical passes of every scan that has a calibration, and publishes their points."""
 
     def __init__(self, bus: Bus, rig: Rig) -> None:
         self._rig = rig.name
         self._starts = bus.subscribe([topics.SCAN_START], depth=8)
-        self._frames = bus.subscribe([topics.CAMERA_LEFT, topics.CAMERA_RIGHT], depth=FRAMES_DEPTH)
+        self._left = bus.subscribe([topics.CAMERA_LEFT], depth=FRAMES_DEPTH)
+        self._right = bus.subscribe([topics.CAMERA_RIGHT], depth=FRAMES_DEPTH)
         self._points = bus.publisher(topics.OPTICAL_POINTS)
-        self._pairs = Pairs()
+        self._pairs = Pairs(self._left, self._right)
         self._scans: dict[str, ScanSetup] = {}
         self._held: dict[str, list[tuple[Message, Message]]] = {}
         self._waiting_since_s: dict[str, float] = {}
@@ -123,8 +105,7 @@ class OpticalSubscriber:
                 self._begin(started)
             self._give_up()
             return
-        frame = self._frames.get(timeout_s)
-        pair = self._pairs.add(frame) if frame is not None else None
+        pair = self._pairs.get(timeout_s)
         if pair is not None:
             self._take(*pair)
 
@@ -134,13 +115,15 @@ class OpticalSubscriber:
             **self._counts,
             "unpaired": self._pairs.unpaired,
             "ms_per_pair": round(self._busy_ms, 2),
-            "frames": self._frames.stats,
+            "left": self._left.stats,
+            "right": self._right.stats,
         }
 
     def close(self) -> None:
         """Stop receiving."""
         self._starts.close()
-        self._frames.close()
+        self._left.close()
+        self._right.close()
 
     def _begin(self, message: Message) -> None:
         try:

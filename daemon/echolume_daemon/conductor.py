@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import secrets
 import threading
 import time
@@ -186,13 +187,9 @@ class Conductor:
 
     def _halt(self, body: Json) -> Json:
         """Stop now. Anybody may: an emergency asks for no lease."""
-        run = self._run
-        try:
+        with contextlib.suppress(WrongStateError):  # idle, or halting already: the devices are stopped all the same
             self.happen(Event.HALT)
-        except WrongStateError:
-            if self._state is not RunState.IDLE:
-                raise
-        make_safe(self._service.bus, SERVICES_OF if run is None else run.kinds, at_once=True)
+        make_safe(self._service.bus, SERVICES_OF, at_once=True)
         self._service.log.warning("halted by %s", text(body, "holder", "somebody"))
         return self._snapshot()
 

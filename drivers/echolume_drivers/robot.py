@@ -304,7 +304,7 @@ class _BringUp:
         axis = self._axis
         axis.check()
         late = time.monotonic() - self._asked_s > POLL_S
-        if late and self._asked is not None:
+        if late and self._asked is not None and axis.state is not DriveState.OPERATION_ENABLED:
             axis.poll()
         state = axis.state
         if state is DriveState.OPERATION_ENABLED:

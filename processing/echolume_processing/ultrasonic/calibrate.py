@@ -147,9 +147,10 @@ def calibrate_plate(pings: Sequence[Ping], settings: ArraySettings) -> ArrayResu
         return fit_plate(poses[kept], times[kept], temperatures[kept], emitter, receivers, nominal, direct, part)
 
     fit = fitted(np.ones(len(pings), dtype=np.bool_))
-    good = np.sqrt(np.nanmean(fit.residuals_mm**2, axis=1)) < max(
-        MAX_RMS_MM, 4 * float(np.median(np.abs(fit.residuals_mm)))
-    )
+    known = np.isfinite(fit.residuals_mm)
+    spread = np.sqrt(np.nansum(fit.residuals_mm**2, axis=1) / np.maximum(known.sum(axis=1), 1))
+    limit_mm = max(MAX_RMS_MM, 4 * float(np.nanmedian(np.abs(fit.residuals_mm))))
+    good = (spread < limit_mm) & (known.sum(axis=1) >= len(receivers) / 2)
     if np.count_nonzero(good) < MIN_PINGS or np.count_nonzero(good) < 0.7 * len(pings):
         raise CalibrationRejectedError(
             f"array calibration: only {int(np.count_nonzero(good))} of {len(pings)} pings fit the plate (rms "

@@ -16,6 +16,7 @@ Waveforms: TypeAlias = NDArray[np.float32]
 """Echoes of all receivers, shape (receivers, samples)."""
 ComplexEnvelope: TypeAlias = NDArray[np.complex64]
 
+FILLED_WHITENING, RESONANT_WHITENING = 0.05, 3.0
 CUTOFF_HZ = 1000.0
 """Cut-off of the paper's third-order Butterworth low-pass."""
 
@@ -126,6 +127,13 @@ class MatchedFilter:
         return out[:, : samples * self.upsampling]
 
 
+def _whitening(power: NDArray[np.float64], taper: NDArray[np.float64]) -> float:
+    """Whitening that suits the templates: a band is filled where power is within 10 dB of the largest."""
+    inside = taper > 0.5
+    filled = float(np.mean(power[:, inside] > 0.1 * power.max(axis=1, keepdims=True)))
+    return FILLED_WHITENING if filled > 0.6 else RESONANT_WHITENING
+
+
 def matched_filter(
     templates: Waveforms,
     origin: float,
@@ -134,7 +142,7 @@ def matched_filter(
     samples: int,
     *,
     upsampling: int = 4,
-    whitening: float = 0.05,
+    whitening: float | None = None,
 ) -> MatchedFilter:
     """Make the matched filter of a set of templates.
 
@@ -149,7 +157,8 @@ def matched_filter(
         Length of the echoes to come.
     whitening : float
         Spectral power, relative to the largest, below which the template is not flattened any further; large values
-        give the plain matched filter (least noise), small ones the shortest compressed pulse.
+        give the plain matched filter (least noise), small ones the shortest compressed pulse. By default small for
+        templates that fill their band, large for resonant ones.
 
     Notes
     -----
@@ -161,7 +170,7 @@ def matched_filter(
     spectrum = np.asarray(fft.rfft(templates.astype(np.float64), length, axis=1))
     power = np.abs(spectrum) ** 2
     taper = band_weights(frequency_hz, *band_hz)
-    floor = whitening * power.max(axis=1, keepdims=True)
+    floor = (_whitening(power, taper) if whitening is None else whitening) * power.max(axis=1, keepdims=True)
     inverse = taper * np.conj(spectrum) / (power + floor)
     inverse = inverse * np.exp(-2j * np.pi * frequency_hz * origin / sample_rate_hz)
     response = np.maximum((taper * power / (power + floor)), 0.0)

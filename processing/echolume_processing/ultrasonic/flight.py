@@ -90,7 +90,8 @@ def first_arrivals(
             continue
         above = np.flatnonzero(heights >= 1.0)
         peak = int(peaks[np.argmax(heights)] if strongest or not above.size else peaks[above[0]])
-        position, value = _vertex(magnitude[k], peak)
+        reach = max(1, round(0.3 * sample_rate_hz / (2 * np.pi * float(bank.bandwidth_hz[k]))))
+        position, value = _vertex(magnitude[k], _climb(magnitude[k], peak), reach)
         angle, slope = _phase_at(compressed[k], position, 2 * np.pi * bank.centre_hz[k] / sample_rate_hz)
         snr = value / max(float(noise[k]), 1e-3 * value)
         if abs(angle) <= MAX_PHASE_RAD:
@@ -102,14 +103,25 @@ def first_arrivals(
     return Arrivals(time_s, amplitude, phase, sigma, np.isfinite(time_s), count)
 
 
-def _vertex(values: NDArray[np.float32], peak: int) -> tuple[float, float]:
-    """Position and height of the parabola through a maximum and its neighbours."""
-    left, middle, right = (float(v) for v in values[peak - 1 : peak + 2])
+def _climb(values: NDArray[np.float32], start: int) -> int:
+    """The local maximum uphill of a sample: the threshold's slope moves the maxima of their ratio."""
+    peak = start
+    while 0 < peak and values[peak - 1] > values[peak]:
+        peak -= 1
+    while peak + 1 < len(values) and values[peak + 1] > values[peak]:
+        peak += 1
+    return peak
+
+
+def _vertex(values: NDArray[np.float32], peak: int, reach: int) -> tuple[float, float]:
+    """Position and height of the parabola through a maximum and the values `reach` samples beside it."""
+    reach = max(1, min(reach, peak, len(values) - 1 - peak))
+    left, middle, right = (float(values[k]) for k in (peak - reach, peak, peak + reach))
     curvature = left - 2 * middle + right
     if curvature >= 0:
         return float(peak), middle
     shift = 0.5 * (left - right) / curvature
-    return peak + shift, middle - 0.25 * (left - right) * shift
+    return peak + reach * shift, middle - 0.25 * (left - right) * shift
 
 
 def _phase_at(row: NDArray[np.complex64], position: float, step_rad: float) -> tuple[float, float]:

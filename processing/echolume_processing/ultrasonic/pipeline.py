@@ -19,7 +19,7 @@ from echolume_processing.ultrasonic.envelope import (
     matched_filter,
     paper_envelope,
 )
-from echolume_processing.ultrasonic.flight import Arrivals, first_arrivals
+from echolume_processing.ultrasonic.flight import MAX_PHASE_RAD, Arrivals, first_arrivals
 
 MIN_PATH_MM = 110.0
 """Shorter paths drown in the cross-talk and its ringing."""
@@ -109,12 +109,16 @@ class UltrasonicPipeline:
         return found, (found.time_s + start_s - self._delays_s) * speed
 
     def strongest(self, ping: Ping, gate_mm: tuple[float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Arrival after the emission (delay included) and amplitude of the strongest echo in a gate, (receivers,)."""
+        """Arrival after the emission (delay included) and amplitude of the strongest echo in a gate, (receivers,).
+
+        The arrival is not a number where envelope and phase contradict each other.
+        """
         waveforms = waveforms_from_counts(ping.echoes)
         found, _ = self.arrivals(
             waveforms, ping.sample_rate_hz, ping.start_s, ping.air_temperature_c, strongest=True, gate_mm=gate_mm
         )
-        return found.time_s + ping.start_s, found.amplitude
+        sure = np.abs(found.phase_rad) <= MAX_PHASE_RAD
+        return np.where(sure, found.time_s + ping.start_s, np.nan), found.amplitude
 
     def band_weights(self, samples: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Frequencies (n,) in Hz and how much of the compressed pulse lies at each (n,), their sum 1."""

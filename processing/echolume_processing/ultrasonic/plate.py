@@ -26,6 +26,9 @@ SPEED_SIGMA = 0.01
 LEVEL_SIGMA = 0.015
 """Of the natural logarithm of a ping's amplitude, averaged over its channels: air, and scatter of the plate."""
 RADIUS_SIGMA = 0.05
+SLIP_MM = 1.0
+"""A path this far from its ping's others has slipped a cycle and is left out."""
+SLIP_ROUNDS = 4
 DIRECT_SIGMA_MM = 0.5
 """How far the direct sound, which leaves the piston sideways, is believed to come from its centre."""
 
@@ -120,6 +123,18 @@ def plate_levels(
     return out / path
 
 
+def _row_means(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean of the finite values of each row, not a number where there are none, (rows,)."""
+    finite = np.isfinite(values)
+    count = finite.sum(axis=1)
+    return np.where(count > 0, np.where(finite, values, 0.0).sum(axis=1) / np.maximum(count, 1), np.nan)
+
+
+def _row_medians(values: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Median of what is known in each row, 0 where nothing is, (rows, 1)."""
+    return np.array([[float(np.median(row[k])) if k.any() else 0.0] for row, k in zip(values, known, strict=True)])
+
+
 def _whitening(n: int) -> NDArray[np.float64]:
     covariance = CHANNEL_SIGMA_MM**2 * np.eye(n) + COMMON_SIGMA_MM**2 * np.ones((n, n))
     values, vectors = np.linalg.eigh(covariance)
@@ -191,7 +206,7 @@ def fit_plate(
         speed = (nominal_speed + p[9] * sigmas[9]) * 1e3
         return float(np.mean((direct * speed - apart_mm - p[11:])[heard]))
 
-    heights = np.full(len(poses), np.nan) if levels is None else np.log(np.nanmean(levels.amplitudes, axis=1))
+    heights = np.full(len(poses), np.nan) if levels is None else np.log(_row_means(levels.amplitudes))
     loud = np.isfinite(heights)
 
     def level_residuals(p: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -215,10 +230,23 @@ def fit_plate(
 
     start = np.zeros(11 + n_receivers)
     start[11:] = np.nanmedian(np.where(known, residuals_mm(start), np.nan), axis=0)
-    solved = least_squares(cost, start, loss="soft_l1", f_scale=3.0, x_scale="jac", max_nfev=60)
-    found = np.asarray(solved.x, dtype=np.float64)
-    jacobian = np.asarray(solved.jac, dtype=np.float64)
-    left = residuals_mm(found)
+    found, jacobian, left = start, np.zeros((0, len(start))), residuals_mm(start)
+    for _ in range(SLIP_ROUNDS):
+        solved = least_squares(cost, found, loss="soft_l1", f_scale=3.0, x_scale="jac", max_nfev=60)
+        found = np.asarray(solved.x, dtype=np.float64)
+        jacobian = np.asarray(solved.jac, dtype=np.float64)
+        left = residuals_mm(found)
+        middle = _row_medians(left, known)
+        slipped = known & ((np.abs(left - middle) > SLIP_MM) | (np.abs(left) > 2 * SLIP_MM))
+        if not slipped.any():
+            break
+        known &= ~slipped
+        if not known.any(axis=0).all():
+            raise CalibrationRejectedError(
+                f"array calibration: paths over the plate contradict each other by {float(np.abs(left).max()):.1f} mm; "
+                "is the bench bare and flat, and the nominal mounting of the array right?"
+            )
+    left = np.where(known, residuals_mm(found), np.nan)
     rms = float(np.sqrt(np.mean(left[known] ** 2)))
     expected = np.hypot(CHANNEL_SIGMA_MM, COMMON_SIGMA_MM)
     data = jacobian[:-11]

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import cast
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -71,8 +74,6 @@ def _limits(found: HybridMap) -> tuple[float, float]:
 
 def _axes3(figure: Figure, field: MapField, limits_mm: tuple[float, float], title: str) -> Axes3D:
     axes = figure.add_subplot(projection="3d")
-    if not isinstance(axes, Axes3D):
-        raise TypeError(f"expected Axes3D, got {type(axes).__name__}")
     axes.set_xlim(*field.x_mm)
     axes.set_ylim(*field.y_mm)
     axes.set_zlim(*limits_mm)
@@ -95,13 +96,23 @@ def _cloud(points: Structured, field: MapField, limits_mm: tuple[float, float], 
         & (np.abs(points["x_mm"] - np.mean(field.x_mm)) <= np.ptp(field.x_mm) / 2)
         & (np.abs(points["y_mm"] - np.mean(field.y_mm)) <= np.ptp(field.y_mm) / 2)
     ]
-    shown = inside[:: max(1, inside.size // MOST_POINTS)]
-    size = 10.0 if shown.size < 5000 else 1.0
-    axes.scatter(
-        shown["x_mm"], shown["y_mm"], shown["z_mm"],
-        c=shown["z_mm"], s=size, cmap=HEIGHT_MAP, vmin=limits_mm[0], vmax=limits_mm[1], linewidths=0,
-    )  # fmt: skip
+    shown = inside[np.random.default_rng(0).permutation(inside.size)[:MOST_POINTS]]
+    share = np.clip((shown["z_mm"] - limits_mm[0]) / (limits_mm[1] - limits_mm[0]), 0, 1)
+    _scatter(axes, shown["x_mm"], shown["y_mm"], shown["z_mm"], colormaps[HEIGHT_MAP](share), shown.size < 5000)
     return figure
+
+
+def _scatter(
+    axes: Axes3D,
+    x_mm: NDArray[np.floating],
+    y_mm: NDArray[np.floating],
+    z_mm: NDArray[np.floating],
+    colour: NDArray[np.float64],
+    few: bool,
+) -> None:
+    """Points (n,) with a colour each (n, 3 or 4)."""
+    put = cast("Callable[..., object]", axes.scatter)  # its annotations leave no room for arrays
+    put(x_mm, y_mm, z_mm, c=colour, s=10.0 if few else 1.5, linewidths=0)
 
 
 def _surface(height_mm: NDArray[np.float64], field: MapField, limits_mm: tuple[float, float], title: str) -> Figure:
@@ -143,29 +154,32 @@ def _hybrid(found: HybridMap, limits_mm: tuple[float, float]) -> Figure:
     figure = Figure(figsize=(9, 6.6), dpi=DPI, layout="constrained")
     axes = _axes3(figure, found.field, limits_mm, "Hybrid image")
     cells = found.cells[np.isfinite(found.cells["front_mm"])]
-    shown = cells[:: max(1, cells.size // MOST_POINTS)]
+    shown = cells[(cells["ix"] + cells["iy"]) % 2 == 0]
     x_mm, y_mm = cell_centres_mm(found.field)
     shade = 0.6 + 0.4 * np.clip((shown["front_mm"] - limits_mm[0]) / (limits_mm[1] - limits_mm[0]), 0, 1)
     colour = LABEL_RGB[shown["label"]] / 255.0 * shade[:, None]
-    axes.scatter(x_mm[shown["ix"]], y_mm[shown["iy"]], shown["front_mm"], c=colour, s=1.5, linewidths=0)
+    behind = shown[np.isfinite(shown["behind_mm"])]
+    pale = np.tile((0.78, 0.88, 0.95), (behind.size, 1))
+    _scatter(axes, x_mm[behind["ix"]], y_mm[behind["iy"]], behind["behind_mm"], pale, False)
+    _scatter(axes, x_mm[shown["ix"]], y_mm[shown["iy"]], shown["front_mm"], colour, False)
     axes.legend(handles=_legend(), loc="upper left", fontsize="small")
     return figure
 
 
 def _legend() -> list[Patch]:
-    return [Patch(color=tuple(float(v) / 255 for v in LABEL_RGB[k]), label=k.name.lower()) for k in Label]
+    return [Patch(color=f"#{bytes(LABEL_RGB[k]).hex()}", label=k.name.lower()) for k in Label]
 
 
 def _labels(found: HybridMap) -> Figure:
     """What each cell is."""
-    figure = Figure(figsize=(6.4, 5.6), dpi=DPI, layout="constrained")
+    figure = Figure(figsize=(7.6, 5.6), dpi=DPI, layout="constrained")
     axes = figure.subplots()
     image = LABEL_RGB[found.image("label")]
     axes.imshow(image, origin="lower", extent=(*found.field.x_mm, *found.field.y_mm))
     axes.set_xlabel("x / mm")
     axes.set_ylabel("y / mm")
     axes.set_title("What each cell is")
-    axes.legend(handles=_legend(), loc="upper right", fontsize="small")
+    axes.legend(handles=_legend(), loc="upper left", bbox_to_anchor=(1.01, 1.0), fontsize="small")
     return figure
 
 

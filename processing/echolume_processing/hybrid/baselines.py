@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from echolume_messages.plan import MapField
 from echolume_messages.types import Structured
 from echolume_processing.hybrid.grid import STEPS_PER_MM, accumulate, cell_index
 from echolume_processing.hybrid.model import cell_centres_mm
+from echolume_processing.hybrid.scipy_typed import NearestPoints
 
 NEAREST_MM = 20.0
 """A cell further than this from any ultrasonic point is not claimed by sound."""
@@ -53,9 +53,8 @@ def nearest(points: Structured, field: MapField) -> NDArray[np.float64]:
     if not points.size:
         return out
     x_mm, y_mm = np.meshgrid(*cell_centres_mm(field))
-    tree = cKDTree(np.column_stack((points["x_mm"], points["y_mm"])).astype(np.float64))
-    _, index = tree.query(np.column_stack((x_mm.ravel(), y_mm.ravel())), distance_upper_bound=NEAREST_MM)
-    index = np.asarray(index, dtype=np.int64)
+    known = NearestPoints(np.column_stack((points["x_mm"], points["y_mm"])).astype(np.float64))
+    _, index = known.nearest(np.column_stack((x_mm.ravel(), y_mm.ravel())), NEAREST_MM)
     found = index < points.size
     out.ravel()[found] = points["z_mm"][index[found]]
     return out

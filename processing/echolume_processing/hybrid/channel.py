@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.fft
 from numpy.typing import NDArray
 
 from echolume_messages.calibration import ArrayCalibration
@@ -13,6 +12,7 @@ from echolume_messages.errors import CalibrationRejectedError
 from echolume_messages.geometry import transform
 from echolume_messages.plan import MapField
 from echolume_processing.hybrid.predict import Aperture, Band, Predictor
+from echolume_processing.hybrid.scipy_typed import fast_length, fft, ifft, rfft
 from echolume_processing.hybrid.surface import surface
 from echolume_processing.ping import Ping
 
@@ -58,9 +58,9 @@ class Channels:
         """Spectra in counts (receivers, bins) of a ping, its time zero moved to the emission."""
         counts = ping.echoes.astype(np.float32)
         counts -= counts.mean(axis=1, keepdims=True)
-        spectrum = scipy.fft.rfft(counts, n=self.band.length, axis=1)[:, self.band.bins]
+        spectrum = rfft(counts, self.band.length)[:, self.band.bins]
         late = np.exp(-2j * np.pi * self.band.frequency_hz * ping.start_s).astype(np.complex64)
-        return spectrum * late * self.filter
+        return (spectrum * late * self.filter).astype(np.complex64)
 
 
 def channels(calibration: ArrayCalibration, band: Band, predictor: Predictor) -> Channels:
@@ -81,12 +81,9 @@ def channels(calibration: ArrayCalibration, band: Band, predictor: Predictor) ->
     image = elements[0] + np.array([0.0, 0.0, 2 * calibration.reference_mm])
     arrival_s = np.linalg.norm(elements[1:] - image, axis=1) / (calibration.speed_of_sound_mps * 1e3)
     templates = np.array(calibration.templates, dtype=np.float64)
-    peak = np.abs(_analytic(templates)).max(axis=1)
+    peak = _envelope_peak(templates)
     templates *= (np.array(calibration.gains) / peak)[:, None]
-    length = max(band.length, templates.shape[1])
-    spectrum = scipy.fft.rfft(templates, n=length, axis=1)
-    if length != band.length:
-        spectrum = scipy.fft.rfft(templates[:, : band.length], axis=1)
+    spectrum = rfft(templates[:, : band.length], band.length)
     spectrum = spectrum[:, band.bins]
     omega = 2 * np.pi * band.frequency_hz
     origin_s = calibration.template_origin / calibration.sample_rate_hz
@@ -114,16 +111,15 @@ def _band_filter(band: Band) -> NDArray[np.float32]:
     return (0.5 - 0.5 * np.cos(np.pi * edge)).astype(np.float32)
 
 
-def _analytic(signal: NDArray[np.float64]) -> NDArray[np.complex128]:
-    """Analytic signal along the last axis."""
+def _envelope_peak(signal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Peak of the envelope along the last axis."""
     n = signal.shape[-1]
-    spectrum = scipy.fft.fft(signal, axis=-1)
     keep = np.zeros(n)
     keep[0] = 1.0
     keep[1 : (n + 1) // 2] = 2.0
     if n % 2 == 0:
         keep[n // 2] = 1.0
-    return scipy.fft.ifft(spectrum * keep, axis=-1)
+    return np.abs(np.fft.ifft(np.fft.fft(signal, axis=-1) * keep, axis=-1)).max(axis=-1)
 
 
 @dataclass(frozen=True)
@@ -145,14 +141,14 @@ class Gate:
         """Gated complex waveform (..., last - first) of band spectra (..., bins)."""
         padded = np.zeros((*spectrum.shape[:-1], self.samples), dtype=np.complex64)
         padded[..., : spectrum.shape[-1]] = spectrum
-        whole = scipy.fft.ifft(padded, axis=-1)
+        whole = ifft(padded)
         return whole[..., self.first : self.last] * self.window
 
     def spectrum(self, waveform: NDArray[np.complex64]) -> NDArray[np.complex64]:
         """Band spectra (..., bins) of gated waveforms (..., last - first)."""
         whole = np.zeros((*waveform.shape[:-1], self.samples), dtype=np.complex64)
         whole[..., self.first : self.last] = waveform
-        return scipy.fft.fft(whole, axis=-1)[..., : self.band.bins.size]
+        return fft(whole)[..., : self.band.bins.size]
 
 
 def gate(band: Band, nearest_s: float, latest_s: float) -> Gate:
@@ -160,7 +156,7 @@ def gate(band: Band, nearest_s: float, latest_s: float) -> Gate:
 
     The waveform is sampled at the width of the band or a little above, which is all it needs.
     """
-    samples = scipy.fft.next_fast_len(int(np.ceil(band.bins.size * 1.1)))
+    samples = fast_length(int(np.ceil(band.bins.size * 1.1)))
     rate_hz = samples * band.sample_rate_hz / band.length
     first = max(0, int(np.floor(nearest_s * rate_hz)))
     last = min(samples, int(np.ceil(latest_s * rate_hz)))

@@ -7,18 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.spatial import cKDTree
 
 from echolume_processing.hybrid.grid import OpticalGrid
+from echolume_processing.hybrid.scipy_typed import EIGHT, Mask, NearestPoints, dilated, labelled, opened
 
 LEAST_POINTS = 2
 LEAST_NEIGHBOURS = 3
 ABSORBING_MM = 9.0
 """A hole that a square of this side fits into is more than a shadow beside a step."""
 BENCH_MM = 0.0
-
-Mask = NDArray[np.bool_]
-_EIGHT = np.ones((3, 3), dtype=np.bool_)
 
 
 @dataclass(frozen=True)
@@ -51,18 +48,14 @@ def close(grid: OpticalGrid) -> Closed:
         on a black surface looks like them.
     """
     seen = np.isfinite(grid.height_mm) & (grid.count >= LEAST_POINTS)
-    neighbours = ndimage.convolve(seen.astype(np.int64), _EIGHT.astype(np.int64), mode="constant") - seen
-    seen &= neighbours >= LEAST_NEIGHBOURS
+    near = np.asarray(ndimage.convolve(seen.astype(np.int64), EIGHT.astype(np.int64), mode="constant"))
+    seen &= near - seen.astype(np.int64) >= LEAST_NEIGHBOURS
     swept = _swept(seen)
     holes = swept & ~seen
-    side = max(1, round(ABSORBING_MM / grid.field.cell_mm))
-    square = np.ones((side, side), dtype=np.bool_)
-    # the border is mirrored, or a hole at the rim would be eaten by the opening
-    pad = side
-    opened = ndimage.binary_opening(np.pad(holes, pad, mode="edge"), square)[pad:-pad, pad:-pad] & holes
-    labels, number = ndimage.label(opened, structure=_EIGHT)
+    wide = opened(holes, max(1, round(ABSORBING_MM / grid.field.cell_mm)))
+    labels, number = labelled(wide)
     absorbing = tuple(np.asarray(labels == k) for k in range(1, number + 1))
-    occluded = holes & ~opened
+    occluded = holes & ~wide
     height_mm = np.where(seen, grid.height_mm, BENCH_MM)
     _fill_from_lower(height_mm, seen, holes)
     return Closed(height_mm, seen, occluded, absorbing, ~swept)
@@ -80,20 +73,21 @@ def _swept(seen: Mask) -> Mask:
 
 def _fill_from_lower(height_mm: NDArray[np.float64], seen: Mask, holes: Mask) -> None:
     """Give each hole cell the height of the nearest seen rim cell among the low ones around it."""
-    labels, number = ndimage.label(holes, structure=_EIGHT)
-    for k, window in enumerate(ndimage.find_objects(labels, max_label=number), start=1):
-        around = tuple(slice(max(0, s.start - 1), s.stop + 1) for s in window)
+    labels, number = labelled(holes)
+    for k in range(1, number + 1):
+        j, i = np.nonzero(labels == k)
+        around = (slice(max(0, j.min() - 1), j.max() + 2), slice(max(0, i.min() - 1), i.max() + 2))
         inside = labels[around] == k
-        rim = ndimage.binary_dilation(inside, structure=_EIGHT) & seen[around]
+        rim = dilated(inside) & seen[around]
         if not rim.any():
             continue
         cells, rim_cells = np.argwhere(inside), np.argwhere(rim)
-        rim_mm = height_mm[around][rim]
-        tree = cKDTree(rim_cells)
-        nearest, _ = tree.query(cells)
         view = height_mm[around]
-        for cell, distance in zip(cells, np.asarray(nearest), strict=True):
-            near = np.array(sorted(tree.query_ball_point(cell, 2 * float(distance) + 3.0)), dtype=np.int64)
+        rim_mm = view[rim]
+        known = NearestPoints(rim_cells.astype(np.float64))
+        nearest, _ = known.nearest(cells.astype(np.float64))
+        for cell, distance in zip(cells, nearest, strict=True):
+            near = known.around(cell.astype(np.float64), 2 * float(distance) + 3.0)
             low = near[rim_mm[near] <= rim_mm[near].min() + 1.0]
             away = ((rim_cells[low] - cell) ** 2).sum(axis=1)
             view[cell[0], cell[1]] = rim_mm[low[int(np.argmin(away))]]

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
-from scipy.spatial import cKDTree
 
 from echolume_messages.plan import MapField
 from echolume_processing.hybrid.grid import cell_index
 from echolume_processing.hybrid.model import cell_centres_mm
 from echolume_processing.hybrid.plates import PingHeights, Plane, fit_plane, ping_heights
+from echolume_processing.hybrid.scipy_typed import NearestPoints, depth_inside, labelled
 from echolume_processing.hybrid.sounding import Sounding, Spectra
 from echolume_processing.hybrid.surface import Surface, reshaped
 from echolume_processing.hybrid.tiles import Mask, covered, occupancy, tiles_over
@@ -81,14 +80,13 @@ class State:
 def pings_near(found: Sounding, mask: Mask, field: MapField, distance_mm: float) -> NDArray[np.int64]:
     """Pings whose foot is within a distance of a mask, sorted."""
     x_mm, y_mm = np.meshgrid(*cell_centres_mm(field))
-    tree = cKDTree(np.column_stack((x_mm[mask], y_mm[mask])))
-    away, _ = tree.query(found.foot_mm)
-    return np.nonzero(np.asarray(away) <= distance_mm)[0]
+    away, _ = NearestPoints(np.column_stack((x_mm[mask], y_mm[mask]))).nearest(found.foot_mm)
+    return np.nonzero(away <= distance_mm)[0]
 
 
 def pings_inside(found: Sounding, mask: Mask, field: MapField, depth_mm: float) -> NDArray[np.int64]:
     """Pings whose foot is at least so deep inside a mask, sorted."""
-    depth = ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1] * field.cell_mm
+    depth = depth_inside(mask) * field.cell_mm
     foot = found.foot_mm
     cell = cell_index(field, foot[:, 0], foot[:, 1])
     return np.nonzero((cell >= 0) & (depth.ravel()[cell] > depth_mm))[0]
@@ -151,9 +149,7 @@ def clusters(found: Sounding, anomalous: NDArray[np.int64]) -> list[NDArray[np.i
     if anomalous.size < LEAST_PINGS:
         return []
     foot = found.foot_mm
-    pitch, _ = cKDTree(foot).query(foot, k=2)
-    reach_mm = 1.6 * float(np.median(np.asarray(pitch)[:, 1]))
-    pairs = cKDTree(foot[anomalous]).query_pairs(reach_mm, output_type="ndarray")
+    pairs = NearestPoints(foot[anomalous]).pairs(1.6 * NearestPoints(foot).spacing())
     group = np.arange(anomalous.size)
     for _ in range(anomalous.size):
         low = np.minimum(group[pairs[:, 0]], group[pairs[:, 1]])
@@ -170,8 +166,8 @@ def clusters(found: Sounding, anomalous: NDArray[np.int64]) -> list[NDArray[np.i
 def _around(found: Sounding, cluster: NDArray[np.int64], field: MapField) -> Mask:
     """Cells near to the feet of a cluster."""
     x_mm, y_mm = np.meshgrid(*cell_centres_mm(field))
-    away, _ = cKDTree(found.foot_mm[cluster]).query(np.column_stack((x_mm.ravel(), y_mm.ravel())))
-    return (np.asarray(away) <= NEIGHBOUR_MM).reshape(field.shape)
+    away, _ = NearestPoints(found.foot_mm[cluster]).nearest(np.column_stack((x_mm.ravel(), y_mm.ravel())))
+    return (away <= NEIGHBOUR_MM).reshape(field.shape)
 
 
 def _extent(state: State, window: Mask, judges: NDArray[np.int64], plane: Plane) -> Mask:
@@ -179,7 +175,7 @@ def _extent(state: State, window: Mask, judges: NDArray[np.int64], plane: Plane)
     tiles = tiles_over(window)
     share = occupancy(state.found, state.scene, state.predicted[judges], judges, plane, tiles)
     mask = covered(share, tiles, window.shape)
-    labels, number = ndimage.label(mask)
+    labels, number = labelled(mask)
     if number <= 1:
         return mask
     sizes = np.bincount(labels.ravel())

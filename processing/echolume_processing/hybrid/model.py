@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +34,7 @@ class HybridMap:
     registration: Registration
     notes: tuple[str, ...] = ()
 
-    def image(self, name: str) -> NDArray[np.generic]:
+    def image(self, name: str) -> NDArray[Any]:
         """One field of the cells as an image, shape (rows along y, columns along x)."""
         return self.cells[name].reshape(self.field.shape)
 
@@ -54,7 +55,7 @@ def cell_centres_mm(field: MapField) -> tuple[NDArray[np.float64], NDArray[np.fl
     rows, columns = field.shape
     x_mm = field.x_mm[0] + (np.arange(columns) + 0.5) * field.cell_mm
     y_mm = field.y_mm[0] + (np.arange(rows) + 0.5) * field.cell_mm
-    return x_mm, y_mm
+    return x_mm.astype(np.float64), y_mm.astype(np.float64)
 
 
 def widened(field: MapField, margin_mm: float) -> MapField:

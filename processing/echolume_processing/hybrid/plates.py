@@ -95,7 +95,7 @@ def fit_plane(found: Sounding, heights: PingHeights, tilted: bool) -> Plane:
     centre = np.array([found.apertures[int(k)].elements_mm[0] for k in heights.which])
     middle = centre[:, :2].mean(axis=0)
     offset = centre[:, :2] - middle
-    level = float(_weighted_median(heights.height_mm, heights.likeness))
+    level = _weighted_median(heights.height_mm, heights.likeness)
     slope = np.zeros(2)
     spread = np.linalg.svd(offset, compute_uv=False) if tilted and len(offset) >= 4 else np.zeros(2)
     if tilted and spread[-1] > 5.0:
@@ -112,7 +112,7 @@ def fit_plane(found: Sounding, heights: PingHeights, tilted: bool) -> Plane:
     return Plane(float(middle[0]), float(middle[1]), level, float(slope[0]), float(slope[1]))
 
 
-def _weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> np.float64:
+def _weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
     order = np.argsort(values, kind="stable")
     share = np.cumsum(weights[order].clip(1e-3))
-    return values[order[int(np.searchsorted(share, 0.5 * share[-1]))]]
+    return float(values[order[int(np.searchsorted(share, 0.5 * share[-1]))]])

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import scipy.fft
 from numpy.typing import NDArray
 from scipy.special import j1
 
 from echolume_messages.calibration import ArrayCalibration
 from echolume_messages.geometry import apply, robot_from_flange
 from echolume_processing.hybrid.kernels import ANGLES, lay_facets, lay_walls
+from echolume_processing.hybrid.scipy_typed import rfft
 from echolume_processing.hybrid.surface import Surface
 
 NODES = 4
@@ -59,14 +59,14 @@ class Band:
     @cached_property
     def frequency_hz(self) -> NDArray[np.float64]:
         """Frequency of each bin of the band."""
-        return self.bins * (self.sample_rate_hz / self.length)
+        return np.asarray(self.bins * (self.sample_rate_hz / self.length), dtype=np.float64)
 
     @cached_property
     def nodes_hz(self) -> NDArray[np.float64]:
         """Chebyshev nodes of the band."""
         k = np.arange(NODES)
         middle, half = 0.5 * (self.low_hz + self.high_hz), 0.5 * (self.high_hz - self.low_hz)
-        return middle - half * np.cos(np.pi * (k + 0.5) / NODES)
+        return np.asarray(middle - half * np.cos(np.pi * (k + 0.5) / NODES), dtype=np.float64)
 
     @cached_property
     def weights(self) -> NDArray[np.float64]:
@@ -125,5 +125,5 @@ class Predictor:
 
     def _to_band(self, laid: NDArray[np.float32]) -> NDArray[np.complex64]:
         """Sum over the nodes of each histogram's spectrum, weighted: (receivers, bins)."""
-        spectrum = scipy.fft.rfft(laid, axis=-1)[..., self._band.bins]
+        spectrum = rfft(laid)[..., self._band.bins]
         return np.einsum("cmf,mf->cf", spectrum, self._factor)

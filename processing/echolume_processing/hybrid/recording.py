@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -95,7 +96,7 @@ def _log_map(recording: rr.RecordingStream, found: HybridMap) -> None:
     recording.log("map/labels", rr.SegmentationImage(_upright(found.image("label"))), static=True)
 
 
-def _upright(image: NDArray[np.generic]) -> NDArray[np.generic]:
+def _upright(image: NDArray[Any]) -> NDArray[Any]:
     """Row 0 at the top is the largest y; unknown heights become 0, which rerun leaves out."""
     flipped = image[::-1]
     return np.ascontiguousarray(np.nan_to_num(flipped, nan=0.0) if flipped.dtype.kind == "f" else flipped)

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from echolume_processing.hybrid.kernels import ANGLES
 from echolume_processing.hybrid.plates import Plane
 from echolume_processing.hybrid.predict import directivity
+from echolume_processing.hybrid.scipy_typed import Mask, closed, interpolated
 from echolume_processing.hybrid.sounding import Sounding, Spectra
 from echolume_processing.hybrid.surface import Surface
 
@@ -20,8 +20,6 @@ NEAR_MM = 50.0
 """Pings further than this from a tile's middle do not judge it."""
 SMOOTHING = 0.03
 SWEEPS = 200
-
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -109,11 +107,11 @@ def covered(share: NDArray[np.float64], tiles: Tiles, shape: tuple[int, int]) ->
     rows, columns = coarse.shape
     at_j = (np.arange(rows * TILE_CELLS) + 0.5) / TILE_CELLS + 0.5
     at_i = (np.arange(columns * TILE_CELLS) + 0.5) / TILE_CELLS + 0.5
-    fine = ndimage.map_coordinates(padded, np.meshgrid(at_j, at_i, indexing="ij"), order=1) > 0.5
+    fine = interpolated(padded, at_j, at_i) > 0.5
     out = np.zeros(shape, dtype=np.bool_)
     j0, i0 = tiles.origin
     target = out[j0 : j0 + fine.shape[0], i0 : i0 + fine.shape[1]]
-    target |= ndimage.binary_fill_holes(fine)[: target.shape[0], : target.shape[1]]
+    target |= closed(fine)[: target.shape[0], : target.shape[1]]
     return out
 
 

@@ -1,0 +1,101 @@
+"""The forward-model gate on a small emulated scene: glass, black, and no false alarm on matte."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+
+from echolume_drivers.emulated.scene import Material
+from echolume_messages.calibration import Calibration
+from echolume_messages.types import OPTICAL_POINT, Label, Provenance
+from echolume_processing.hybrid.digest import digest
+from echolume_processing.hybrid.fuse import fuse
+from echolume_processing.hybrid.model import HybridMap
+from processing.hybrid_scan import FIELD, SmallScan, all_matte, glass_and_black, small_scan
+
+RIM = 120 - 48
+
+
+@pytest.fixture(scope="module")
+def scan() -> SmallScan:
+    return small_scan(glass_and_black())
+
+
+@pytest.fixture(scope="module")
+def found(scan: SmallScan) -> HybridMap:
+    return fuse(scan.optical, scan.pings, scan.calibration, FIELD)
+
+
+def cut(image: np.ndarray) -> np.ndarray:
+    return image[RIM:-RIM, RIM:-RIM]
+
+
+def test_glass_is_found_and_has_two_layers(scan: SmallScan, found: HybridMap) -> None:
+    glass = cut(scan.scene.material) == Material.GLASS
+    named = found.image("label") == Label.TRANSPARENT
+    assert (glass & named).sum() / glass.sum() > 0.85
+    assert (glass & named).sum() / named.sum() > 0.9
+    assert np.abs(found.image("front_mm")[glass & named] - 24.0).max() < 0.3
+    assert np.abs(found.image("behind_mm")[glass & named]).max() < 1.0
+    assert (found.image("provenance")[named] & Provenance.ULTRASONIC).all()
+    assert (found.image("ultrasonic_n")[named] > 0).all()
+
+
+def test_the_black_block_gets_its_height_from_sound(scan: SmallScan, found: HybridMap) -> None:
+    black = cut(scan.scene.material) == Material.BLACK
+    named = found.image("label") == Label.ABSORBING
+    assert (black & named).sum() / (black | named).sum() > 0.95
+    assert np.abs(found.image("front_mm")[black & named] - 17.0).max() < 0.3
+    assert (found.image("provenance")[named] == Provenance.ULTRASONIC).all()
+    assert np.isnan(found.image("behind_mm")[named]).all()
+
+
+def test_every_cell_with_a_height_names_its_source_and_no_other_does(found: HybridMap) -> None:
+    claimed = np.isfinite(found.cells["front_mm"])
+    assert (found.cells["provenance"][claimed] != Provenance.NONE).all()
+    assert (found.cells["label"][claimed] != Label.UNKNOWN).all()
+    assert (found.cells["label"][~claimed] == Label.UNKNOWN).all()
+
+
+def test_most_cells_are_right_to_a_millimetre(scan: SmallScan, found: HybridMap) -> None:
+    error_mm = np.abs(found.image("front_mm") - cut(scan.scene.front_mm))
+    assert (error_mm <= 1.0).mean() > 0.95
+
+
+def test_the_order_of_arrival_does_not_matter(scan: SmallScan, found: HybridMap) -> None:
+    order = np.random.default_rng(3).permutation(scan.optical.size)
+    again = fuse(scan.optical[order], scan.pings[::-1], scan.calibration, FIELD)
+    assert digest(again) == digest(found)
+
+
+def test_a_matte_scene_has_nothing_transparent_and_registration_finds_an_imposed_offset() -> None:
+    scan = small_scan(all_matte(), seed=2)
+    pose = scan.calibration.array.array_pose
+    pose[2, 3] += 0.4  # array z looks down: the calibration now says 0.4 mm too low
+    moved = msgspec.structs.replace(scan.calibration.array, flange_from_array=pose.tolist())
+    found = fuse(scan.optical, scan.pings, msgspec.structs.replace(scan.calibration, array=moved), FIELD)
+    assert not np.isin(found.cells["label"], (Label.TRANSPARENT, Label.ABSORBING, Label.UNKNOWN)).any()
+    assert abs(abs(found.registration.dz_mm) - 0.4) < 0.25
+    assert found.registration.residual_db < -16
+    assert found.notes == ()
+
+
+def test_without_pings_there_is_a_map_of_light_that_says_so(scan: SmallScan) -> None:
+    found = fuse(scan.optical, [], scan.calibration, FIELD)
+    assert not (found.cells["label"] == Label.TRANSPARENT).any()
+    assert (found.cells["label"] == Label.UNKNOWN).sum() > 900  # the black block
+    assert any("no pings" in note for note in found.notes)
+
+
+def test_without_light_everything_stays_unknown(scan: SmallScan) -> None:
+    found = fuse(np.zeros(0, dtype=OPTICAL_POINT), scan.pings[:3], scan.calibration, FIELD)
+    assert (found.cells["label"] == Label.UNKNOWN).all()
+    assert np.isnan(found.cells["front_mm"]).all()
+
+
+def test_a_narrow_band_says_what_it_cannot_decide(scan: SmallScan) -> None:
+    array = msgspec.structs.replace(scan.calibration.array, low_hz=38e3, high_hz=42e3)
+    narrow: Calibration = msgspec.structs.replace(scan.calibration, array=array)
+    found = fuse(scan.optical, scan.pings[::6], narrow, FIELD)
+    assert any("narrow band" in note for note in found.notes)

@@ -1,0 +1,63 @@
+"""Closing the optical surface."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from echolume_messages.plan import MapField
+from echolume_processing.hybrid.grid import OpticalGrid
+from echolume_processing.hybrid.holes import close
+
+FIELD = MapField(x_mm=(0.0, 60.0), y_mm=(0.0, 50.0), cell_mm=1.0)
+
+
+def grid_of(height_mm: np.ndarray) -> OpticalGrid:
+    seen = np.isfinite(height_mm)
+    return OpticalGrid(
+        FIELD, height_mm, np.where(seen, 0.1, np.nan), np.where(seen, 9, 0), np.where(seen, 1, 0).astype(np.uint8)
+    )
+
+
+def test_a_big_hole_is_absorbing_and_a_narrow_one_is_occluded() -> None:
+    height_mm = np.zeros(FIELD.shape)
+    height_mm[20:40, 30:50] = np.nan
+    height_mm[5:10, 5:25] = np.nan
+    closed = close(grid_of(height_mm))
+    assert len(closed.absorbing) == 1
+    assert closed.absorbing[0].sum() == 400
+    assert closed.occluded.sum() == 100
+    assert np.isfinite(closed.height_mm).all()
+
+
+def test_a_shadow_beside_a_step_gets_the_lower_height() -> None:
+    height_mm = np.zeros(FIELD.shape)
+    height_mm[:, 20:30] = 25.0
+    height_mm[:, 30:34] = np.nan
+    closed = close(grid_of(height_mm))
+    assert closed.occluded[:, 30:34].all()
+    assert (closed.height_mm[:, 30:34] == 0.0).all()
+
+
+def test_lone_points_on_a_black_surface_do_not_break_its_hole() -> None:
+    height_mm = np.zeros(FIELD.shape)
+    height_mm[15:40, 20:45] = np.nan
+    height_mm[25, 30] = 77.0
+    height_mm[31, 38] = -40.0
+    closed = close(grid_of(height_mm))
+    assert len(closed.absorbing) == 1
+    assert closed.absorbing[0].sum() == 625
+
+
+def test_beyond_the_optical_pass_the_bench_goes_on() -> None:
+    height_mm = np.full(FIELD.shape, np.nan)
+    height_mm[10:40, 10:50] = 3.0
+    closed = close(grid_of(height_mm))
+    assert closed.outside.sum() == FIELD.shape[0] * FIELD.shape[1] - 30 * 40
+    assert (closed.height_mm[closed.outside] == 0.0).all()
+    assert not closed.absorbing
+
+
+def test_nothing_seen_is_no_hole() -> None:
+    closed = close(grid_of(np.full(FIELD.shape, np.nan)))
+    assert closed.outside.all()
+    assert not closed.seen.any()

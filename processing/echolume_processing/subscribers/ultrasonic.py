@@ -63,7 +63,13 @@ def read_start(message: Message, rig: str) -> tuple[str, ScanSetup]:
         raise CalibrationMissingError(
             f"scan {start.scan}: its calibration is of rig {calibration.rig!r}, this is {rig!r}"
         )
-    return start.scan, ScanSetup(UltrasonicPipeline(calibration), calibration.digest)
+    try:
+        pipeline = UltrasonicPipeline(calibration)
+    except ValueError as error:
+        raise CalibrationMissingError(
+            f"scan {start.scan}: its calibration of the array is unusable: {error}"
+        ) from error
+    return start.scan, ScanSetup(pipeline, calibration.digest)
 
 
 class UltrasonicSubscriber:

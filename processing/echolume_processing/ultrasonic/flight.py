@@ -106,7 +106,7 @@ def first_arrivals(
 def _climb(values: NDArray[np.float32], start: int) -> int:
     """The local maximum uphill of a sample: the threshold's slope moves the maxima of their ratio."""
     peak = start
-    while 0 < peak and values[peak - 1] > values[peak]:
+    while peak > 0 and values[peak - 1] > values[peak]:
         peak -= 1
     while peak + 1 < len(values) and values[peak + 1] > values[peak]:
         peak += 1

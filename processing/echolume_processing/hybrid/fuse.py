@@ -140,6 +140,7 @@ class _Builder:
         self.notes: list[str] = []
         self._wide = wide
         self._grid, self._closed = grid, closed
+        self._dark = np.any(closed.absorbing, axis=0) if closed.absorbing else np.zeros(wide.shape, dtype=np.bool_)
         cells = empty_cells(wide)
         self._cells = cells.reshape(wide.shape)
         seen, occluded = closed.seen, closed.occluded
@@ -167,7 +168,7 @@ class _Builder:
 
     def transparent(self, patch: Patch) -> None:
         """A plate that light goes through, or that has two possible heights."""
-        mask = patch.mask & ~(self._cells["label"] == Label.ABSORBING)
+        mask = patch.mask & ~self._dark
         if patch.ambiguous:
             self.notes.append(
                 f"a transparent region of {int(mask.sum())} cells stays unknown: two heights explain its echoes"

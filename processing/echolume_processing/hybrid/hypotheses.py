@@ -18,9 +18,14 @@ from echolume_processing.hybrid.surface import Surface, reshaped
 from echolume_processing.hybrid.tiles import Mask, covered, occupancy, tiles_over
 
 INSIDE_MM = 5.0
-"""A ping counts as over a hole if its foot is this far inside."""
-LIKENESS = 0.5
+"""A ping counts as over a hole if its foot is this far inside; less in a small one."""
+CANDIDATES = 4
+APART_MM = 3.0
+"""So many heights are tried for a hole, so far apart."""
+EXPLAINED = 0.2
+"""A residual energy below this share of the measured one is an explanation in itself."""
 LEAST_PINGS = 3
+LEAST_OVER_HOLE = 2
 JUDGED_MM = 30.0
 """Pings whose foot is this near to a region judge it."""
 NOTICED_MM = 50.0
@@ -95,14 +100,16 @@ def pings_inside(found: Sounding, mask: Mask, field: MapField, depth_mm: float) 
 def absorbing(state: State, hole: Mask) -> Patch | None:
     """Height of the surface that fills an optical hole; None if sound does not see it either."""
     found, field = state.found, state.scene.field
-    over = pings_inside(found, hole, field, INSIDE_MM)
-    if over.size < LEAST_PINGS:
+    deepest_mm = float(depth_inside(hole).max()) * field.cell_mm
+    over = pings_inside(found, hole, field, min(INSIDE_MM, 0.3 * deepest_mm))
+    if over.size < LEAST_OVER_HOLE:
         return None
     heights = ping_heights(found, over)
-    if np.median(heights.likeness) < LIKENESS:
-        return None
-    planes = [fit_plane(found, heights, tilted) for tilted in (False, True)]
-    return _settle(state, hole, planes, heights)
+    middle = found.foot_mm[over].mean(axis=0)
+    level = [Plane(float(middle[0]), float(middle[1]), z) for z in heights.candidates(CANDIDATES, APART_MM)]
+    patch = _settle(state, hole, [*level, fit_plane(found, heights, True)], heights)
+    after = _residual(found, found.predict(_with_patch(state.scene, hole, patch.plane), over), over)
+    return patch if after < max(EXPLAINED, ACCEPTED * _residual(found, state.predicted[over], over)) else None
 
 
 def transparent(state: State, cluster: NDArray[np.int64]) -> Patch | None:
@@ -133,8 +140,7 @@ def transparent(state: State, cluster: NDArray[np.int64]) -> Patch | None:
         inside = np.isin(heights.which, pings_inside(found, mask, field, 0.0))
         if inside.sum() < LEAST_PINGS:
             continue
-        over = PingHeights(heights.which[inside], heights.height_mm[inside], heights.likeness[inside])
-        patch = _settle(state, mask, [plane], over)
+        patch = _settle(state, mask, [plane], heights.some(inside))
         rise_mm = float(np.median((patch.plane.image(field) - state.scene.height_mm)[mask]))
         if rise_mm < LEAST_RISE_MM:
             continue
@@ -201,8 +207,8 @@ def _settle(state: State, mask: Mask, planes: list[Plane], over: PingHeights) ->
     def cost(plane: Plane) -> float:
         return _residual(state.found, state.found.predict(_with_patch(near, mask, plane), judges), judges)
 
-    costs = [cost(p) for p in planes]
-    best = 1 if len(planes) > 1 and costs[1] < TILT_GAIN * costs[0] else 0
+    costs = [cost(p) * (1.0 if p.slope_x == p.slope_y == 0.0 else 1 / TILT_GAIN) for p in planes]
+    best = int(np.argmin(costs))
     plane, level = planes[best], costs[best]
     half_wave_mm = 1e3 * state.found.speed_mps / (state.found.band.low_hz + state.found.band.high_hz)
     narrow = (state.found.band.high_hz - state.found.band.low_hz) < NARROW * state.found.band.low_hz

@@ -49,6 +49,27 @@ class PingHeights:
     which: NDArray[np.int64]
     height_mm: NDArray[np.float64]
     likeness: NDArray[np.float64]
+    stacked: NDArray[np.float64]
+    """Sum over the pings of the correlation with a plate at each of `heights_mm`."""
+
+    def some(self, chosen: NDArray[np.bool_]) -> PingHeights:
+        """The same of some of the pings."""
+        return PingHeights(self.which[chosen], self.height_mm[chosen], self.likeness[chosen], self.stacked)
+
+    def candidates(self, most: int, apart_mm: float) -> list[float]:
+        """Heights at which all pings together see a plate, the likeliest first, at least `apart_mm` apart."""
+        left, out = self.stacked.copy(), list[float]()
+        heights_mm = tried_heights_mm()
+        while len(out) < most and np.isfinite(left).any():
+            top = int(np.argmax(left))
+            out.append(float(heights_mm[top]))
+            left[np.abs(heights_mm - heights_mm[top]) < apart_mm] = -np.inf
+        return out
+
+
+def tried_heights_mm() -> NDArray[np.float64]:
+    """The heights at which a plate is sought."""
+    return np.arange(LOWEST_MM, CEILING_MM, HEIGHT_STEP_MM)
 
 
 def ping_heights(found: Sounding, which: NDArray[np.int64]) -> PingHeights:
@@ -59,16 +80,18 @@ def ping_heights(found: Sounding, which: NDArray[np.int64]) -> PingHeights:
     A narrow-band pulse gives almost the same likeness every half wavelength; the plane through many pings has
     the same ambiguity, and only the whole waveform model can judge it.
     """
-    heights_mm = np.arange(LOWEST_MM, CEILING_MM, HEIGHT_STEP_MM)
+    heights_mm = tried_heights_mm()
+    stacked = np.zeros(heights_mm.size)
     measured = found.gate.spectrum(found.measured[which])[..., :: found.gate.thinning]
     best_mm, like = np.empty(which.size), np.empty(which.size)
     for n, k in enumerate(which):
         plates = _plate_spectra(found, found.apertures[int(k)], heights_mm)
         match = np.tensordot(plates.conj(), measured[n], axes=([1, 2], [0, 1])).real
         match /= np.sqrt((np.abs(plates) ** 2).sum(axis=(1, 2)) * (np.abs(measured[n]) ** 2).sum())
+        stacked += match
         top = int(match.argmax())
         best_mm[n], like[n] = heights_mm[top], match[top]
-    return PingHeights(which, best_mm, like)
+    return PingHeights(which, best_mm, like, stacked)
 
 
 def _plate_spectra(found: Sounding, where: Aperture, heights_mm: NDArray[np.float64]) -> NDArray[np.complex64]:

@@ -23,6 +23,8 @@ SEARCH_MM = 1.5
 """Self-registration looks this far up and down."""
 STEP_MM = 0.02
 GAIN_TERMS = 4
+BEST_SHARE = 1 / 3
+"""So many pings, the best ones, register the array; the others may look at what light cannot see."""
 
 Waveforms = NDArray[np.complex64]
 """Gated complex waveforms (pings, receivers, samples)."""
@@ -109,7 +111,7 @@ def register(found: Sounding, predicted: Spectra) -> tuple[Sounding, Spectra, Re
 
     Notes
     -----
-    The offset is the median over the better half of the pings of the shift that fits each best, so pings over
+    The offset is the median, over the best third of the pings, of the shift that fits each best, so pings over
     glass do not take part. It also takes up most of an error in the speed of sound, since all ranges of a scan
     are alike. The gain is a complex polynomial over frequency, fitted on the same pings.
     """
@@ -119,7 +121,7 @@ def register(found: Sounding, predicted: Spectra) -> tuple[Sounding, Spectra, Re
     like = _likeness(found, predicted, np.exp(-slow * shifts_mm[:, None]).astype(np.complex64))
     best = like.argmax(axis=1)
     peak = like[everything, best]
-    good = peak >= np.median(peak)
+    good = peak >= np.quantile(peak, 1 - BEST_SHARE)
     dz_mm = float(np.median(shifts_mm[best[good]]))
     turn = np.exp(-slow * dz_mm).astype(np.complex64)
     gain = _gain(found, predicted[good] * turn, found.measured[good])

@@ -117,13 +117,13 @@ class Acquisition:
         devices = cast("dict[str, Json]", self._ask(name, "status", {}).get("devices", {}))
         return [f"{key}: {d.get('error')}" for key, d in devices.items() if d.get("state") == "absent"]
 
-    def prepare(self, kind: str) -> None:
-        """Bring the devices of a kind of pass to their starting state."""
+    def prepare(self, kind: str, *, begin: bool = False) -> None:
+        """Bring the devices of a kind of pass to their starting state; `begin`: at the start of a scan."""
         for name in SERVICES_OF[kind]:
             if name == "guide" and not self._ask("guide", "status", {}).get("homed"):
                 self._ask("guide", "home", {}, 90.0)
-            elif name == "cameras" and self._ask("cameras", "status", {}).get("scan") != self.scan:
-                self._ask("cameras", "begin", {"scan": self.scan, "calibration": self.calibration})
+            elif name == "cameras" and (begin or self._ask("cameras", "status", {}).get("scan") != self.scan):
+                self._ask("cameras", "begin", {"scan": self.scan, "calibration": self.calibration}, 20.0)
             elif name == "robot" and not self._ask("robot", "status", {}).get("enabled"):
                 self._ask("robot", "enable", {}, 30.0)
 

@@ -22,6 +22,8 @@ MAX_OUTSTANDING = 4
 """Triggers that may be fired ahead of their frames."""
 FRAME_TIMEOUT_S = 3.0
 """Beyond its exposure, a frame has this long to arrive before its trigger is missing."""
+BEGIN_S = 15.0
+"""Longest exposure and its frame, of the scan before."""
 _READ_S = 0.2
 _COMMAND_LIMIT_S = 30.0
 
@@ -85,7 +87,7 @@ class CamerasService:
         self._scan = self._calibration = self._pass = ""
         self._external_s: float | None = None
         self._pulse = 0
-        self._counted = False
+        self._last: Armed | None = None
         self._changed = threading.Condition()
         self._trigger: Slot[Trigger] = Slot(
             "trigger",
@@ -142,20 +144,25 @@ class CamerasService:
         return eye
 
     def _prepare_trigger(self, unit: Trigger) -> None:
+        """A unit that was opened anew may count from anywhere."""
         unit.disarm()
-        self._external_s, self._counted = None, False
+        count = unit.count()
+        with self._changed:
+            for eye in self._eyes:
+                eye.missing.extend(eye.matcher.abandon())
+            self._external_s, self._pulse, self._last = None, count, None
 
     # -- commands
 
     def _begin(self, body: Json) -> Json:
+        """Another scan: what is still under way of the one before comes to its end first."""
         scan, calibration = text(body, "scan"), text(body, "calibration", "")
-        with self._trigger.use() as unit:
-            unit.disarm()
-            self._external_s, self._counted = None, False
+        self._disarm({})
         with self._changed:
-            self._scan, self._calibration = scan, calibration
+            if not self._changed.wait_for(lambda: not any(e.matcher.outstanding for e in self._eyes), BEGIN_S):
+                raise DeviceSilentError(f"cameras: frames of scan {self._scan} are still awaited after {BEGIN_S:.0f} s")
+            self._scan, self._calibration, self._last = scan, calibration, None
             for eye in self._eyes:
-                eye.matcher.reset(forget_ids=False)
                 eye.matcher.revoked.clear()
                 eye.missing.clear()
                 eye.counts.clear()
@@ -166,16 +173,17 @@ class CamerasService:
         absent = [eye.slot for eye in self._eyes if not eye.slot.present]
         if absent:
             raise DeviceAbsentError("; ".join(str(slot.status()["error"]) for slot in absent))
+        with self._trigger.use() as unit:
+            self._reconcile(unit)
         self._await_room(exposure_s)
         with self._trigger.use() as unit:
-            if not self._counted:
-                self._pulse, self._counted = unit.count(), True
             if external and self._external_s != exposure_s:
                 unit.arm_external(exposure_s)
                 self._external_s = exposure_s
             item = self._await_frames(body, exposure_s)
             if not external:
-                self._fire(unit, item)
+                self._external_s = None
+                unit.fire(exposure_s)
         return {"pulse": item.pulse}
 
     def _await_room(self, exposure_s: float) -> None:
@@ -189,13 +197,12 @@ class CamerasService:
         with self._changed:
             if not self._changed.wait_for(room, limit_s):
                 raise DeviceSilentError(f"cameras: frames awaited for {limit_s:.1f} s did not come; is a camera stuck?")
-            if not all(eye.matcher.proven for eye in self._eyes):
-                self._counted = False
 
     def _await_frames(self, body: Json, exposure_s: float) -> Armed:
         self._pulse += 1
         x_mm = None if body.get("x_mm") is None else number(body, "x_mm")
         item = Armed(
+            scan=self._scan,
             pulse=self._pulse,
             trigger=whole(body, "trigger"),
             pass_name=text(body, "pass"),
@@ -207,34 +214,31 @@ class CamerasService:
         )
         deadline_s = time.monotonic() + exposure_s + FRAME_TIMEOUT_S
         with self._changed:
-            self._pass = item.pass_name
+            self._pass, self._last = item.pass_name, item
             for eye in self._eyes:
                 eye.matcher.arm(item, deadline_s)
         return item
 
-    def _fire(self, unit: Trigger, item: Armed) -> None:
-        self._external_s = None
-        try:
-            unit.fire(item.exposure_s)
-        except DeviceError:
-            with self._changed:
+    def _reconcile(self, unit: Trigger) -> None:
+        """The unit's own count has the last word: what it did not fire is missing, what nobody armed is in doubt."""
+        count = unit.count()
+        with self._changed:
+            for eye in self._eyes:
+                eye.missing.extend(eye.matcher.withdraw(count))
+            if count > self._pulse:
+                self._service.log.warning("trigger unit: %d pulses that nobody asked for", count - self._pulse)
                 for eye in self._eyes:
-                    eye.matcher.withdraw(item.pulse - 1)
-                self._counted = False
-            raise
+                    eye.matcher.revoked.extend([self._last] if self._last is not None else [])
+            self._pulse = count
+            self._changed.notify_all()
 
     def _disarm(self, _body: Json) -> Json:
         """Take back what was armed and not fired."""
         with self._trigger.use() as unit:
             unit.disarm()
             self._external_s = None
-            count = unit.count()
-        with self._changed:
-            for eye in self._eyes:
-                eye.missing.extend(eye.matcher.withdraw(count))
-            self._pulse = count
-            self._changed.notify_all()
-        return {"count": count}
+            self._reconcile(unit)
+        return {"count": self._pulse}
 
     def _status(self, _body: Json) -> Json:
         out = self.health()
@@ -274,6 +278,9 @@ class CamerasService:
             elif item in eye.missing:
                 eye.missing.remove(item)
             self._changed.notify_all()
+        if item is not None and item.scan != self._scan:
+            self._service.log.info("%s: a late frame of scan %s is left out", eye.slot.name, item.scan)
+            return
         if item is None or verdict is not Verdict.MATCHED:
             self._service.log.warning("%s: frame id %d is %s", eye.slot.name, frame.frame_id, verdict)
             return

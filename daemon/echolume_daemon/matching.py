@@ -20,6 +20,7 @@ _OVERTAKEN_S = 0.5
 class Armed:
     """A trigger whose frame is awaited."""
 
+    scan: str
     pulse: int
     """Count of the trigger unit after this pulse."""
     trigger: int
@@ -110,26 +111,19 @@ class FrameMatcher:
         return late
 
     def abandon(self) -> list[Armed]:
-        """The camera was opened anew: what was awaited will not come, and ids start from wherever they like."""
+        """Camera or trigger unit was opened anew: what was awaited will not come, and numbers start from anywhere."""
         gone = [item for item, _ in self._deadlines.values()]
-        self.reset(forget_ids=True)
-        return gone
-
-    def reset(self, *, forget_ids: bool) -> None:
-        """Begin a scan, or a camera that was opened anew (`forget_ids`: it counts from wherever it likes)."""
-        self._deadlines.clear()
-        self._expired.clear()
-        self._done.clear()
+        for store in (self._deadlines, self._expired, self._done):
+            store.clear()
         self._unproven.clear()
-        self._proven = False
+        self._base, self._proven = None, False
         self._late = self._slips = 0
-        if forget_ids:
-            self._base = None
+        return gone
 
     def _slipped(self) -> None:
         """Twice in a row a frame came "late" and the awaited one did not: the camera missed a pulse itself."""
         self.revoked.extend(self._unproven)
-        self.reset(forget_ids=True)
+        self.abandon()
 
     def _learn(self, frame_id: int) -> None:
         """One trigger outstanding, one frame come: if it is none of the past, it is this one's."""

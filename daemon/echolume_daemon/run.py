@@ -111,7 +111,7 @@ class ScanRun:
             calibration=self.acquisition.calibration,
         )
         for kind in self.kinds:
-            self.acquisition.prepare(kind)
+            self.acquisition.prepare(kind, begin=True)
         self.stage.advance(Event.ARMED)
         for item in self.plan.passes:
             self._pass(item.name)

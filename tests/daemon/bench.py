@@ -18,6 +18,7 @@ from echolume_daemon import array, cameras, conductor, guide, robot
 from echolume_messages.bus import Bus, connect
 from echolume_messages.bus.router import open_router
 from echolume_messages.errors import DeviceAbsentError, DeviceFaultError
+from echolume_messages.header import Header
 from echolume_messages.rig import (
     ArraySettings,
     BusSettings,
@@ -123,6 +124,8 @@ class FakeTrigger:
     wired: list[FakeCamera]
     armed_s: float | None = None
     pulses: int = 0
+    fired_at: dict[int, float | None] = field(default_factory=dict)
+    x_mm: float | None = None
 
     def open(self) -> None: ...
     def close(self) -> None: ...
@@ -142,6 +145,7 @@ class FakeTrigger:
 
     def pulse(self, exposure_s: float) -> None:
         self.pulses += 1
+        self.fired_at[self.pulses] = self.x_mm
         for camera in self.wired:
             camera.pulse(exposure_s)
 
@@ -181,6 +185,7 @@ class FakeGuide:
             raise DeviceFaultError("guide: not homed")
         self.on_expose(x_mm)
         self.laser = True
+        self.trigger.x_mm = x_mm
         if self.trigger.armed_s is not None:
             self.trigger.pulse(exposure_s)
         self.laser = False
@@ -259,6 +264,7 @@ class FakeRecorder:
         self.closed: list[str] = []
         self.kept: list[tuple[str, int, int]] = []
         self.frames: dict[tuple[str, int, int], np.ndarray] = {}
+        self.headers: dict[tuple[str, int, int], Header] = {}
         self._inbox = bus.subscribe([CAMERA_LEFT, CAMERA_RIGHT, ECHOES, LEDGER, SCAN_START], depth=256)
         self._durable = bus.publisher(DURABLE)
         self._stop = threading.Event()
@@ -289,6 +295,7 @@ class FakeRecorder:
                 continue
             self.kept.append(key)
             self.frames[key] = message.payload
+            self.headers[key] = header
             told = {"scan": header.scan, "durable": {header.stream: header.seq}, "records": [[*key, header.seq]]}
             for _ in range(1 + self.echo):
                 self.tell(told | {"count": len(self.kept)})
@@ -343,6 +350,12 @@ class Bench:
             self._threads[name] = threading.Thread(target=run, name=f"bench-{name}")
             self._threads[name].start()
         wait_until(lambda: set(names or mains) <= self.bus.alive(), "services alive")
+
+    def frames_are_where_they_were_taken(self) -> bool:
+        """Whether every frame's position is the one at which its pulse was fired; a frame shows its pulse's number."""
+        frames = {key: frame for key, frame in self.recorder.frames.items() if key[0].startswith("cameras/")}
+        taken = {key: self.trigger.fired_at[int(frame[0, 0])] for key, frame in frames.items()}
+        return bool(taken) and all(self.recorder.headers[key].source.x_mm == x_mm for key, x_mm in taken.items())
 
     def kill_router(self) -> None:
         """The router is gone from now on."""

@@ -68,6 +68,7 @@ def test_a_scan_matches_every_trigger(bench: Bench) -> None:
     assert ledger["triggers"] == {"light": list(range(8)), "sound": list(range(8, 14))}
     assert bench.guide.exposed == [float(x) for x in range(-3, 5)]
     assert not bench.guide.laser
+    assert bench.frames_are_where_they_were_taken()
     assert bench.recorder.opened == [{"scan": scan, "name": "raw", "directory": "/archive"}]
     assert bench.recorder.closed == [scan]
     assert bench.recorder.kept[0][0] == "conductor/start"
@@ -85,6 +86,7 @@ def test_a_dropped_frame_is_named_and_acquired_again(bench: Bench) -> None:
     assert (entry["planned"], entry["fired"], entry["matched"], entry["missing"]) == (8, 9, 8, 0)
     assert entry["records"]["missing"] == 1
     assert ledger["attempts"] == {"2": 1}
+    assert bench.frames_are_where_they_were_taken()
     assert bench.recorder.frames["cameras/left", 3, 0][0, 0] == 4
     assert bench.recorder.frames["cameras/right", 3, 0][0, 0] == 4
 
@@ -279,3 +281,50 @@ def test_what_a_restarted_recorder_says_again_is_no_duplicate(bench: Bench) -> N
     ledger = client.wait()
     assert ledger["passes"]["sound"]["duplicate"] == 0
     assert ledger["acknowledged"] == 6
+
+
+def arm(bench: Bench, trigger: int, x_mm: float) -> None:
+    """Arm as the conductor does."""
+    body = {"trigger": trigger, "pass": "light", "attempt": 0, "exposure_s": 0.004, "external": True}
+    bench.bus.request("cameras", "arm", body | {"x_mm": x_mm, "sigma_mm": 0.01, "laser_on": True})
+
+
+def test_a_trigger_that_was_armed_and_never_fired_shifts_nobody(bench: Bench) -> None:
+    bench.start("guide", "cameras")
+    wait_until(lambda: bench.guide.homed or not bench.bus.request("guide", "home"), "guide homed")
+    bench.bus.request("cameras", "begin", {"scan": "s", "calibration": ""})
+    for trigger in range(12):
+        arm(bench, trigger, float(trigger))
+        if trigger not in (3, 7, 8):
+            bench.bus.request("guide", "expose", {"x_mm": float(trigger), "exposure_s": 0.004})
+    wait_until(lambda: len(bench.recorder.frames) == 18, "all frames recorded")
+    assert bench.frames_are_where_they_were_taken()
+    missing = bench.bus.request("cameras", "status")["missing"]
+    assert {trigger for _, trigger, _ in missing} == {3, 7, 8}
+
+
+def test_a_pulse_that_nobody_asked_for_puts_its_neighbour_in_doubt(bench: Bench) -> None:
+    bench.start("guide", "cameras")
+    wait_until(lambda: bench.guide.homed or not bench.bus.request("guide", "home"), "guide homed")
+    bench.bus.request("cameras", "begin", {"scan": "s", "calibration": ""})
+    for trigger in range(6):
+        arm(bench, trigger, float(trigger))
+        if trigger == 2:
+            bench.trigger.pulse(0.004)
+        bench.bus.request("guide", "expose", {"x_mm": float(trigger), "exposure_s": 0.004})
+    wait_until(lambda: ("cameras/right", 5, 0) in bench.recorder.frames, "the last frame recorded")
+    status = bench.bus.request("cameras", "status")
+    assert {(topic, trigger) for topic, trigger, _ in status["revoked"]} == {("cameras/left", 2), ("cameras/right", 2)}
+    assert bench.trigger.fired_at[int(bench.recorder.frames["cameras/left", 5, 0][0, 0])] == 5.0
+
+
+def test_a_scan_that_begins_while_frames_of_the_one_before_are_awaited_gets_only_its_own(bench: Bench) -> None:
+    bench.start()
+    wait_until(lambda: bench.guide.homed or not bench.bus.request("guide", "home"), "guide homed")
+    bench.bus.request("cameras", "begin", {"scan": "before", "calibration": ""})
+    arm(bench, 0, 77.0)
+    client = ScanClient(bench.bus, "ann@lab")
+    client.start(f'name = "small"\n{LIGHT}')
+    entry = client.wait()["passes"]["light"]
+    assert (entry["fired"], entry["matched"], entry["extra"], entry["duplicate"]) == (8, 8, 0, 0)
+    assert bench.frames_are_where_they_were_taken()

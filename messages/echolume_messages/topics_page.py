@@ -10,7 +10,7 @@ from echolume_messages.topics import SHARDS, TOPICS, Topic
 
 
 def _kind(dtype: np.dtype[np.generic]) -> str:
-    return dtype.str if dtype.names is None else "{" + ", ".join(f"{n} {dtype[n].str}" for n in dtype.names) + "}"
+    return ", ".join(f"{name} {kind[0].str}" for name, kind in (dtype.fields or {}).items())
 
 
 def _row(topic: Topic) -> str:
@@ -28,9 +28,9 @@ def page() -> str:
         "",
         "Made from `messages/echolume_messages/topics.py`; a test keeps both equal.",
         "",
-        f"Keys are `echolume/v1/<rig>/data/<service>/<stream>`; triggered streams end in one more chunk, trigger mod {SHARDS}.",
-        "Payloads are NPY 1.0 bytes, the attachment is a JSON header. Streams of `uint8 (n)` that are no images hold JSON",
-        "text.",
+        "Keys are `echolume/v1/<rig>/data/<service>/<stream>`; triggered streams end in one more chunk, "
+        f"trigger mod {SHARDS}.",
+        "Payloads are NPY 1.0 bytes, the attachment is a JSON header. Flat `uint8` streams hold JSON text.",
         "",
         "| stream | shape | nominal Hz | recorded | triggered | what |",
         "|---|---|---|---|---|---|",

@@ -20,6 +20,14 @@ from echolume_messages.types import Label, OpticalSource, Structured
 from echolume_processing.hybrid.baselines import Baselines
 from echolume_processing.hybrid.model import HybridMap, cell_centres_mm
 from echolume_processing.hybrid.ply import LABEL_RGB
+from echolume_processing.ultrasonic.image import (
+    GrayScale,
+    Raster,
+    edge_segments,
+    gaussian,
+    segments_to_rig,
+    unsharp,
+)
 
 MOST_POINTS = 20_000
 """A cloud is thinned to this for drawing."""
@@ -46,6 +54,7 @@ def draw(optical: Structured, ultrasonic: Structured, found: HybridMap, others: 
     pictures = {
         "fig08_ultrasonic_cloud.png": _cloud(ultrasonic, found.field, limits_mm, "Ultrasonic points"),
         "fig09_ultrasonic_interpolated.png": _interpolated(others.ultrasonic_mm, found.field, limits_mm),
+        "fig10_edges.png": _edges(others.ultrasonic_mm, found.field, limits_mm),
         "fig11_optical_cloud.png": _cloud(
             optical[optical["source"] != OpticalSource.STEREO], found.field, limits_mm, "Active triangulation"
         ),
@@ -74,6 +83,11 @@ def _limits(found: HybridMap) -> tuple[float, float]:
 
 def _axes3(figure: Figure, field: MapField, limits_mm: tuple[float, float], title: str) -> Axes3D:
     axes = figure.add_subplot(projection="3d")
+    _set_limits(axes, field, limits_mm, title)
+    return axes
+
+
+def _set_limits(axes: Axes3D, field: MapField, limits_mm: tuple[float, float], title: str) -> None:
     axes.set_xlim(*field.x_mm)
     axes.set_ylim(*field.y_mm)
     axes.set_zlim(*limits_mm)
@@ -83,7 +97,6 @@ def _axes3(figure: Figure, field: MapField, limits_mm: tuple[float, float], titl
     axes.set_zlabel("z / mm")
     axes.set_title(title)
     axes.view_init(elev=42, azim=-62)
-    return axes
 
 
 def _cloud(points: Structured, field: MapField, limits_mm: tuple[float, float], title: str) -> Figure:
@@ -146,6 +159,27 @@ def _interpolated(height_mm: NDArray[np.float64], field: MapField, limits_mm: tu
     left.set_title("Ultrasonic, nearest interpolation")
     _image(figure, right, height_mm, field, limits_mm, "gray")
     right.set_title("Gray levels")
+    return figure
+
+
+def _edges(height_mm: NDArray[np.float64], field: MapField, limits_mm: tuple[float, float]) -> Figure:
+    """Straight edges of the gray-level image by Hough's transform, and back in three dimensions."""
+    figure = Figure(figsize=(12, 5.2), dpi=DPI, layout="constrained")
+    left = figure.add_subplot(1, 2, 1)
+    right = figure.add_subplot(1, 2, 2, projection="3d")
+    x_mm, y_mm = cell_centres_mm(field)
+    raster = Raster(float(x_mm[0]), float(y_mm[0]), field.cell_mm, *field.shape)
+    heights_mm = np.nan_to_num(np.clip(height_mm, *limits_mm), nan=limits_mm[0])
+    smooth = unsharp(gaussian(GrayScale(*limits_mm).image(heights_mm), 4.0), 4.0)
+    segments = edge_segments(smooth, min_length_px=max(5, field.shape[0] // 10))
+    left.imshow(smooth, origin="lower", extent=(*field.x_mm, *field.y_mm), cmap="gray")
+    left.set_title(f"{len(segments)} edges on the filtered gray levels")
+    left.set_xlabel("x / mm")
+    left.set_ylabel("y / mm")
+    _set_limits(right, field, limits_mm, "Edges in 3D")
+    for (x0, y0, z0), (x1, y1, z1) in segments_to_rig(segments, heights_mm, raster).tolist():
+        left.plot([x0, x1], [y0, y1], color="tab:orange", linewidth=1.5)
+        right.plot([x0, x1], [y0, y1], [z0, z1], color="tab:orange", linewidth=1.5)
     return figure
 
 

@@ -116,7 +116,8 @@ def test_the_hybrid_map_finds_the_glass_and_beats_each_sense(finished: Run) -> N
 def test_reprocessing_the_archive_gives_the_same_digest(finished: Run, tmp_path: Path) -> None:
     report = json.loads((finished.out / "report.json").read_text(encoding="utf-8"))
     done = subprocess.run(
-        [sys.executable, "-m", "echolume", "reprocess", str(finished.out / "raw.mcap"), "--out", str(tmp_path), "--json"],
+        [sys.executable, "-m", "echolume", "reprocess", str(finished.out / "raw.mcap"), "--out", str(tmp_path),
+         "--json"],
         capture_output=True, text=True, timeout=180, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

@@ -58,6 +58,12 @@ def test_a_lost_acknowledged_record_fails() -> None:
     assert any(reason.startswith("archive") for reason in verdict(found))
 
 
+def test_a_map_made_without_some_triggers_fails() -> None:
+    found = report()
+    found["unprocessed"] = {"light": [3, 4]}
+    assert any("2 triggers of pass 'light'" in reason for reason in verdict(found))
+
+
 @pytest.mark.parametrize("other", ["optical", "ultrasonic"])
 def test_a_map_no_better_than_one_sensor_fails(other: str) -> None:
     found = report()

@@ -15,6 +15,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+
 from daemon.bench import free_endpoint, make_rig, wait_until
 from echolume_daemon import recorder
 from echolume_messages import archive, topics

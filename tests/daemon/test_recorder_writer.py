@@ -13,6 +13,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+
 from echolume_daemon.mcap_writer import ArchiveWriter
 from echolume_messages import archive, topics
 from echolume_messages.bus import Message
@@ -20,8 +23,6 @@ from echolume_messages.codec import json_array
 from echolume_messages.errors import ArchiveError
 from echolume_messages.header import Header, Source
 from echolume_messages.topics import Topic
-from mcap.reader import make_reader
-from mcap.stream_reader import StreamReader
 
 WALL_NS = 1_700_000_000_000_000_000
 

@@ -66,7 +66,7 @@ def small_scan(scene: Scene, seed: int = 1, pitch_mm: float = 12.0) -> SmallScan
         )
         for k, pose in enumerate(poses)
     ]
-    return SmallScan(scene, _optical(scene, rng), pings, _calibration(settings, truth, rng))
+    return SmallScan(scene, _optical(scene, rng), pings, calibration_of(settings, truth, rng))
 
 
 def stripes(points: np.ndarray) -> dict[int, np.ndarray]:
@@ -88,7 +88,7 @@ def _optical(scene: Scene, rng: np.random.Generator) -> np.ndarray:
     return points
 
 
-def _calibration(settings: ArraySettings, truth: ArrayTruth, rng: np.random.Generator) -> Calibration:
+def calibration_of(settings: ArraySettings, truth: ArrayTruth, rng: np.random.Generator) -> Calibration:
     """What a calibration would find: templates over a plate, the pose 0.1 mm off, the radius 3 % off."""
     down = transform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, REFERENCE_MM]))
     plates = [simulate_ping(plate(), down, settings, truth, TEMPERATURE_C, rng) for _ in range(4)]

@@ -63,10 +63,11 @@ def test_most_cells_are_right_to_a_millimetre(scan: SmallScan, found: HybridMap)
     assert (error_mm <= 1.0).mean() > 0.95
 
 
-def test_the_order_of_arrival_does_not_matter(scan: SmallScan, found: HybridMap) -> None:
+def test_the_order_of_arrival_does_not_matter(scan: SmallScan) -> None:
     order = np.random.default_rng(3).permutation(scan.optical.size)
-    again = fuse(scan.optical[order], scan.pings[::-1], scan.calibration, FIELD)
-    assert digest(again) == digest(found)
+    one = fuse(scan.optical, scan.pings[::3], scan.calibration, FIELD)
+    two = fuse(scan.optical[order], scan.pings[::3][::-1], scan.calibration, FIELD)
+    assert digest(one) == digest(two)
 
 
 def test_a_matte_scene_has_nothing_transparent_and_registration_finds_an_imposed_offset() -> None:

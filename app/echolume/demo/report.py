@@ -7,14 +7,12 @@ from typing import Any, cast
 
 Report = dict[str, Any]
 
-GATES = ("f1_at_1mm",)
-
 
 def verdict(report: Report) -> list[str]:
     """Why the demo failed; empty where it succeeded.
 
-    It succeeds only if the ledger closes, every acknowledged record is in the archive, and the hybrid map beats each
-    sensor alone on ``f1_at_1mm``.
+    It succeeds only if the ledger closes, every acknowledged record is in the archive, every matched trigger is in the
+    map, and the hybrid map beats each sensor alone on ``f1_at_1mm``.
     """
     reasons: list[str] = []
     for name, row in cast("dict[str, dict[str, int]]", report["ledger"]).items():
@@ -26,6 +24,10 @@ def verdict(report: Report) -> list[str]:
     archive = report["archive"]
     if archive["found"] < archive["acknowledged"]:
         reasons.append(f"archive: {archive['acknowledged']} records acknowledged, {archive['found']} found")
+    reasons.extend(
+        f"map: made without {len(triggers)} triggers of pass {name!r} that never reached it"
+        for name, triggers in cast("dict[str, list[int]]", report.get("unprocessed", {})).items()
+    )
     maps = report.get("maps")
     if maps:
         hybrid = maps["hybrid"]["f1_at_1mm"]

@@ -99,6 +99,7 @@ def run_demo(settings: DemoSettings, progress: Progress) -> Report:
             },
             "resources": {"peak_pss_mib": tree.peak_pss_mib},
             "digest": {"hybrid": done["digest"]},
+            "unprocessed": done["missing"],
             "notes": done.get("notes", []),
         }
     (out / "report.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")

@@ -11,7 +11,24 @@ from echolume_messages.errors import RouterUnreachableError
 MAX_MESSAGE_BYTES = 128 << 20
 
 
-def _settings(shared_memory: bool) -> dict[str, object]:
+QUEUE_BATCHES = 16
+"""Batches of 64 KiB that a link's queue of each data priority holds: most of a frame instead of a tenth."""
+CLIENT_PATIENCE_US = 100_000
+"""A client's puts come from a thread of their own, which may wait this long for its link before it drops a record."""
+
+
+def _drop(client: bool) -> dict[str, int]:
+    """When a full link drops a record. A router waits as shortly as zenoh's defaults do: others need it meanwhile."""
+    if not client:
+        return {"wait_before_drop": 1000, "max_wait_before_drop_fragments": 50_000}
+    return {"wait_before_drop": CLIENT_PATIENCE_US, "max_wait_before_drop_fragments": 10 * CLIENT_PATIENCE_US}
+
+
+def _settings(shared_memory: bool, client: bool) -> dict[str, object]:
+    queue = {
+        "size": {"data_high": QUEUE_BATCHES, "data": QUEUE_BATCHES, "data_low": QUEUE_BATCHES},
+        "congestion_control": {"drop": _drop(client), "block": {"wait_before_close": 100_000}},
+    }
     return {
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "timestamping": {"enabled": True},
@@ -19,7 +36,7 @@ def _settings(shared_memory: bool) -> dict[str, object]:
         "transport": {
             "shared_memory": {"enabled": shared_memory},
             "link": {
-                "tx": {"lease": 2000, "queue": {"congestion_control": {"block": {"wait_before_close": 100_000}}}},
+                "tx": {"lease": 2000, "queue": queue},
                 "rx": {"max_message_size": MAX_MESSAGE_BYTES},
             },
         },
@@ -34,7 +51,7 @@ def open_client(endpoint: str, timeout_s: float, shared_memory: bool) -> zenoh.S
     RouterUnreachableError
         No router answered within `timeout_s`, or it refused this client.
     """
-    settings = _settings(shared_memory) | {
+    settings = _settings(shared_memory, client=True) | {
         "mode": "client",
         "connect": {"endpoints": [endpoint], "timeout_ms": round(timeout_s * 1e3), "exit_on_failure": True},
         "listen": {"endpoints": []},
@@ -56,7 +73,7 @@ def open_router_session(endpoint: str, shared_memory: bool) -> zenoh.Session:
     RouterUnreachableError
         The endpoint cannot be listened on, e.g. because its port is in use.
     """
-    settings = _settings(shared_memory) | {
+    settings = _settings(shared_memory, client=False) | {
         "mode": "router",
         "connect": {"endpoints": []},
         "listen": {"endpoints": [endpoint], "exit_on_failure": True},

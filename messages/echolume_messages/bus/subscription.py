@@ -262,7 +262,7 @@ class Subscription:
                 consolidation=zenoh.ConsolidationMode.NONE,
                 timeout=QUERY_S,
                 congestion_control=zenoh.CongestionControl.DROP,
-                priority=zenoh.Priority.BACKGROUND,
+                priority=zenoh.Priority.DATA_LOW,
             )
             for reply in replies:
                 if reply.ok is not None:

@@ -1,8 +1,9 @@
-"""Calibrate cameras, laser or array.
+"""Calibrate cameras, laser, array, or the whole rig.
 
 examples:
   echolume calibrate cameras boards/ --pattern 9x6 --square 25
   echolume calibrate laser calibrate.mcap --into calibration.json
+  echolume calibrate rig calibrate.mcap --out calibration.json
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ import json
 import re
 import sys
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,14 +21,17 @@ from echolume_messages.errors import ConfigError
 if TYPE_CHECKING:
     from echolume_messages.types import Frame
 
-ARRAY_MODULE = "echolume_processing.commands.calibrate_array"
+ARCHIVE_MODULES = {
+    "array": "echolume_processing.commands.calibrate_array",
+    "rig": "echolume_processing.commands.calibrate_whole",
+}
 IMAGE_NAME = re.compile(r"left(?P<number>.*)\.(?:jpe?g|png|bmp|tiff?)", re.IGNORECASE)
 PUBLISHED = re.compile(r"^avg_reprojection_error:\s*(?P<value>[-+.0-9eE]+)\s*$", re.MULTILINE)
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the subcommands; each imports its libraries only when it runs."""
-    kinds = parser.add_subparsers(dest="kind", required=True, metavar="cameras|laser|array")
+    kinds = parser.add_subparsers(dest="kind", required=True, metavar="cameras|laser|array|rig")
     cameras = kinds.add_parser(
         "cameras",
         help="both cameras, from a folder of board images",
@@ -52,13 +55,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
     laser.add_argument("--square", type=float, default=20.0, metavar="MM", help="size of a square (default: 20)")
     laser.add_argument("--into", type=Path, metavar="FILE", help="calibration file whose optical parts to replace")
     laser.add_argument("--json", action="store_true", help="print the figures as JSON")
-    if find_spec(ARRAY_MODULE) is not None:
-        array = kinds.add_parser(
-            "array",
-            help="the ultrasonic array, from the archive of a calibration scan",
+    for name, module in ARCHIVE_MODULES.items():
+        what = "the ultrasonic array" if name == "array" else "cameras, laser and array"
+        parser_of = kinds.add_parser(
+            name,
+            help=f"{what}, from the archive of a calibration scan",
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-        import_module(ARRAY_MODULE).configure(array)
+        import_module(module).configure(parser_of)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -67,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
         return run_cameras(args)
     if args.kind == "laser":
         return run_laser(args)
-    return int(import_module(ARRAY_MODULE).run(args))
+    return int(import_module(ARCHIVE_MODULES[args.kind]).run(args))
 
 
 def parse_pattern(text: str) -> tuple[int, int]:

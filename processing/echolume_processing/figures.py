@@ -52,7 +52,7 @@ def draw(optical: Structured, ultrasonic: Structured, found: HybridMap, others: 
     out.mkdir(parents=True, exist_ok=True)
     limits_mm = _limits(found)
     pictures = {
-        "fig08_ultrasonic_cloud.png": _cloud(ultrasonic, found.field, limits_mm, "Ultrasonic points"),
+        "fig08_ultrasonic_cloud.png": _cloud(ultrasonic, found.field, limits_mm, "Ultrasound"),
         "fig09_ultrasonic_interpolated.png": _interpolated(others.ultrasonic_mm, found.field, limits_mm),
         "fig10_edges.png": _edges(others.ultrasonic_mm, found.field, limits_mm),
         "fig11_optical_cloud.png": _cloud(
@@ -125,7 +125,7 @@ def _scatter(
 ) -> None:
     """Points (n,) with a colour each (n, 3 or 4)."""
     put = cast("Callable[..., object]", axes.scatter)  # its annotations leave no room for arrays
-    put(x_mm, y_mm, z_mm, c=colour, s=10.0 if few else 1.5, linewidths=0)
+    put(x_mm, y_mm, z_mm, c=colour, s=10.0 if few else 2.5, linewidths=0)
 
 
 def _surface(height_mm: NDArray[np.float64], field: MapField, limits_mm: tuple[float, float], title: str) -> Figure:
@@ -170,8 +170,8 @@ def _edges(height_mm: NDArray[np.float64], field: MapField, limits_mm: tuple[flo
     x_mm, y_mm = cell_centres_mm(field)
     raster = Raster(float(x_mm[0]), float(y_mm[0]), field.cell_mm, *field.shape)
     heights_mm = np.nan_to_num(np.clip(height_mm, *limits_mm), nan=limits_mm[0])
-    smooth = unsharp(gaussian(GrayScale(*limits_mm).image(heights_mm), 4.0), 4.0)
-    segments = edge_segments(smooth, min_length_px=max(5, field.shape[0] // 10))
+    smooth = unsharp(gaussian(GrayScale(*limits_mm).image(heights_mm), 2.0), 4.0)
+    segments = edge_segments(smooth, min_length_px=max(5, field.shape[0] // 12), max_gap_px=8)
     left.imshow(smooth, origin="lower", extent=(*field.x_mm, *field.y_mm), cmap="gray")
     left.set_title(f"{len(segments)} edges on the filtered gray levels")
     left.set_xlabel("x / mm")

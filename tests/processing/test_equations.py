@@ -60,7 +60,7 @@ def test_equation_5_far_away_is_the_wave_of_a_point_source_of_the_disks_area() -
     assert p[0] == pytest.approx(point, rel=1e-3)
 
 
-def test_equation_5_of_a_slow_wave_before_the_disks_centre_is_that_of_two_edges() -> None:
+def test_equation_5_before_the_disks_centre_is_the_wave_of_the_centre_less_that_of_the_edge() -> None:
     """On the axis the integral is exp(-j k z) - exp(-j k sqrt(z^2 + R^2))."""
     z_mm = 7.5  # sqrt(7.5^2 + 10^2) = 12.5
     expected = np.exp(-1j * WAVENUMBER * z_mm) - np.exp(-1j * WAVENUMBER * 12.5)

@@ -13,7 +13,7 @@ from echolume_messages.types import Label, Provenance, Structured
 from echolume_processing.hybrid import holes
 from echolume_processing.hybrid.grid import OpticalGrid, accumulate
 from echolume_processing.hybrid.hypotheses import Patch, State, absorbing, clusters, transparent
-from echolume_processing.hybrid.model import HybridMap, Registration, empty_cells, widened
+from echolume_processing.hybrid.model import HybridMap, Registration, empty_cells, widened, window_of
 from echolume_processing.hybrid.sounding import register, sounding
 from echolume_processing.hybrid.surface import surface
 from echolume_processing.hybrid.tiles import Mask
@@ -61,10 +61,10 @@ def fuse(optical: Structured, pings: Sequence[Ping], calibration: Calibration, f
     wide = widened(field, MARGIN_MM)
     grid = accumulate(optical, wide)
     closed = holes.close(grid)
-    builder = _Builder(wide, grid, closed)
+    builder = _Builder(wide, field, grid, closed)
     if not pings or not closed.seen.any():
         missing = "no pings" if not pings else "no optical points"
-        return builder.finish(field, Registration(), (f"{missing}: nothing was compared",))
+        return builder.finish(Registration(), (f"{missing}: nothing was compared",))
     found = sounding(sorted(pings, key=lambda p: p.trigger), calibration.array)
     scene = surface(closed.height_mm, wide)
     everything = np.arange(len(found.apertures))
@@ -77,7 +77,7 @@ def fuse(optical: Structured, pings: Sequence[Ping], calibration: Calibration, f
             registration.dz_mm + again.dz_mm, again.speed_of_sound_mps, again.pings, again.residual_db
         )
     _find_plates(state, builder)
-    return builder.finish(field, registration, (*builder.notes, *_limits(calibration)))
+    return builder.finish(registration, (*builder.notes, *_limits(calibration)))
 
 
 def _fill_holes(state: State, found_holes: Sequence[Mask], builder: _Builder) -> State:
@@ -136,9 +136,10 @@ def _limits(calibration: Calibration) -> tuple[str, ...]:
 class _Builder:
     """Collects what each cell of the wide field is."""
 
-    def __init__(self, wide: MapField, grid: OpticalGrid, closed: holes.Closed) -> None:
+    def __init__(self, wide: MapField, field: MapField, grid: OpticalGrid, closed: holes.Closed) -> None:
         self.notes: list[str] = []
-        self._wide = wide
+        self._wide, self._field = wide, field
+        self._window = window_of(wide, field)
         self._grid, self._closed = grid, closed
         self._dark = np.any(closed.absorbing, axis=0) if closed.absorbing else np.zeros(wide.shape, dtype=np.bool_)
         cells = empty_cells(wide)
@@ -159,10 +160,8 @@ class _Builder:
     def absorbing(self, hole: Mask, patch: Patch | None) -> None:
         """A hole got its height from sound, or stays unknown."""
         if patch is None or patch.ambiguous:
-            self.notes.append(
-                f"a dark region of {int(hole.sum())} cells stays unknown: "
-                + ("no echo fits it" if patch is None else "two heights explain its echoes equally well")
-            )
+            why = "no echo fits it" if patch is None else "two heights explain its echoes equally well"
+            self._note(hole, f"a dark region of {{cells}} cells stays unknown: {why}")
             return
         self._put(hole, patch, Label.ABSORBING)
 
@@ -170,9 +169,7 @@ class _Builder:
         """A plate that light goes through, or that has two possible heights."""
         mask = patch.mask & ~self._dark
         if patch.ambiguous:
-            self.notes.append(
-                f"a transparent region of {int(mask.sum())} cells stays unknown: two heights explain its echoes"
-            )
+            self._note(mask, "a transparent region of {cells} cells stays unknown: two heights explain its echoes")
             self._forget(mask)
             return
         self._put(mask, patch, Label.TRANSPARENT)
@@ -191,9 +188,10 @@ class _Builder:
         mask = np.zeros(self._wide.shape, dtype=np.bool_)
         for x, y in foot_mm:
             mask |= (np.abs(x_mm - x) <= UNEXPLAINED_MM) & (np.abs(y_mm - y) <= UNEXPLAINED_MM)
-        self.notes.append(
-            f"light and sound disagree in a region of {len(foot_mm)} pings around "
-            f"x {foot_mm[:, 0].mean():.0f}, y {foot_mm[:, 1].mean():.0f} mm, and no plate explains it: unknown"
+        self._note(
+            mask,
+            f"light and sound disagree in {{cells}} cells around x {foot_mm[:, 0].mean():.0f}, "
+            f"y {foot_mm[:, 1].mean():.0f} mm, and no plate explains it: unknown",
         )
         self._forget(mask)
 
@@ -205,19 +203,22 @@ class _Builder:
         view["provenance"][mask] = Provenance.ULTRASONIC
         view["ultrasonic_n"][mask] = min(patch.pings, _COUNT_LIMIT)
 
+    def _note(self, mask: Mask, text: str) -> None:
+        """Keep a note, unless it is about cells beyond the map."""
+        inside = int(mask[self._window].sum())
+        if inside:
+            self.notes.append(text.format(cells=inside))
+
     def _forget(self, mask: Mask) -> None:
         view = self._cells
         view["front_mm"][mask] = view["sigma_mm"][mask] = np.nan
         view["label"][mask] = Label.UNKNOWN
 
-    def finish(self, field: MapField, registration: Registration, notes: tuple[str, ...]) -> HybridMap:
+    def finish(self, registration: Registration, notes: tuple[str, ...]) -> HybridMap:
         """Cut the map out of the wide field."""
-        j0 = round((field.y_mm[0] - self._wide.y_mm[0]) / field.cell_mm)
-        i0 = round((field.x_mm[0] - self._wide.x_mm[0]) / field.cell_mm)
-        rows, columns = field.shape
-        cells = empty_cells(field)
-        part = self._cells[j0 : j0 + rows, i0 : i0 + columns].reshape(-1)
+        cells = empty_cells(self._field)
+        part = self._cells[self._window].reshape(-1)
         for name in cells.dtype.names or ():
             if name not in ("ix", "iy"):
                 cells[name] = part[name]
-        return HybridMap(field, cells, registration, notes)
+        return HybridMap(self._field, cells, registration, notes)

@@ -66,7 +66,7 @@ def _swept(seen: Mask) -> Mask:
     out = np.zeros(seen.shape, dtype=np.bool_)
     rows = np.nonzero(seen.sum(axis=1) >= 0.1 * seen.any(axis=0).sum())[0]
     columns = np.nonzero(seen.sum(axis=0) >= 0.1 * seen.any(axis=1).sum())[0]
-    if rows.size and columns.size:
+    if seen.any() and rows.size and columns.size:
         out[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] = True
     return out
 

@@ -66,3 +66,11 @@ def widened(field: MapField, margin_mm: float) -> MapField:
         y_mm=(field.y_mm[0] - more_mm, field.y_mm[1] + more_mm),
         cell_mm=field.cell_mm,
     )
+
+
+def window_of(wide: MapField, field: MapField) -> tuple[slice, slice]:
+    """Rows and columns that a field takes up in a wider one of the same raster."""
+    j = round((field.y_mm[0] - wide.y_mm[0]) / field.cell_mm)
+    i = round((field.x_mm[0] - wide.x_mm[0]) / field.cell_mm)
+    rows, columns = field.shape
+    return slice(j, j + rows), slice(i, i + columns)

@@ -29,11 +29,16 @@ _header_decoder = msgspec.json.Decoder(Header)
 _header_encoder = msgspec.json.Encoder()
 
 
+@lru_cache(maxsize=64)
+def _descr(dtype: np.dtype[np.generic]) -> object:
+    """What an NPY header says of a dtype."""
+    return np.lib.format.dtype_to_descr(dtype)
+
+
 @lru_cache(maxsize=512)
 def _preamble(dtype: np.dtype[np.generic], shape: tuple[int, ...]) -> bytes:
     """Magic, version, length and header text, padded so that the data starts at a multiple of 64 bytes."""
-    descr = np.lib.format.dtype_to_descr(dtype)
-    text = f"{{'descr': {descr!r}, 'fortran_order': False, 'shape': {shape!r}, }}".encode("ascii")
+    text = f"{{'descr': {_descr(dtype)!r}, 'fortran_order': False, 'shape': {shape!r}, }}".encode("ascii")
     pad = -(len(MAGIC) + 2 + len(text) + 1) % ALIGN
     length = len(text) + pad + 1
     return MAGIC + length.to_bytes(2, "little") + text + b" " * pad + b"\n"
@@ -125,7 +130,7 @@ def decode(data: bytes | memoryview, topic: Topic) -> NDArray[np.generic]:
         descr, shape = _parse_preamble(bytes(data[start:offset]))
     except PayloadError as error:
         raise PayloadError(f"{topic.name}: {error}") from error
-    if descr != np.lib.format.dtype_to_descr(topic.dtype):
+    if descr != _descr(topic.dtype):
         raise PayloadError(f"{topic.name}: expected dtype {topic.dtype}, got {descr!r}")
     size = check_shape(shape, topic)
     if len(data) - offset != size:

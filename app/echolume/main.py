@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import logging
 import os
 import sys
@@ -76,6 +77,8 @@ def _run(entry: EntryPoint, name: str, rest: list[str]) -> int:
 
     try:
         module = entry.load()
+    except KeyboardInterrupt:
+        return _interrupted()
     except ModuleNotFoundError as error:
         if error.name is None or error.name.startswith("echolume"):
             raise
@@ -91,17 +94,45 @@ def _run(entry: EntryPoint, name: str, rest: list[str]) -> int:
     )
     module.configure(parser)
     args = parser.parse_args(rest)
-    logging.basicConfig(
-        level=os.environ.get("ECHOLUME_LOG", "INFO").upper(), format="%(levelname)s %(name)s: %(message)s"
-    )
+    level = os.environ.get("ECHOLUME_LOG", "").upper() or "INFO"
+    if level not in logging.getLevelNamesMapping():
+        known = ", ".join(logging.getLevelNamesMapping())
+        sys.stderr.write(f"echolume: $ECHOLUME_LOG is {level!r}; known levels: {known}\n")
+        return 2
+    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s")
     try:
-        return int(module.run(args))
+        return _flushed(int(module.run(args)))
     except EcholumeError as error:
         sys.stderr.write(f"echolume: {error}\n")
         return error.exit_code
     except KeyboardInterrupt:
-        sys.stderr.write("echolume: interrupted\n")
-        return 130
+        return _interrupted()
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+        _give_up_stdout()
+        return 141
+    except OSError as error:
+        # The system's refusal of a file is no fault of the program; one that names no file may be.
+        if error.filename is None and error.errno != errno.ENOSPC:
+            raise
+        where = f"{error.filename}: " if error.filename is not None else ""
+        sys.stderr.write(f"echolume: {where}{error.strerror}\n")
+        return 1
+
+
+def _flushed(code: int) -> int:
+    """The exit code, once the output is out; a reader that has seen enough (``| head -1``) changes nothing."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        _give_up_stdout()
+    return code
+
+
+def _give_up_stdout() -> None:
+    """Let the interpreter's last flush go nowhere, instead of failing on the closed pipe."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _interrupted() -> int:
+    sys.stderr.write("echolume: interrupted\n")
+    return 130

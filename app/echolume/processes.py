@@ -32,6 +32,7 @@ class Child:
     name: str
     popen: subprocess.Popen[bytes]
     log: Path
+    wave: int
 
     def tail(self, lines: int = 12) -> str:
         """The last lines of the log."""
@@ -70,8 +71,11 @@ class ProcessTree:
         """Largest summed proportional set size seen, MiB."""
         return self._sampler.peak_mib
 
-    def start(self, name: str, arguments: Sequence[str]) -> Child:
-        """Start ``echolume ARGUMENTS`` with its output in a log of its own. Call from the main thread."""
+    def start(self, name: str, arguments: Sequence[str], wave: int = 0) -> Child:
+        """Start ``echolume ARGUMENTS`` with its output in a log of its own. Call from the main thread.
+
+        Children of a higher `wave` rest on those of the lower ones: they are stopped, and awaited, before them.
+        """
         log = self._logs / f"{name}.log"
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         with log.open("wb") as sink:
@@ -84,7 +88,7 @@ class ProcessTree:
                 preexec_fn=_die_with_parent,
                 env=environment,
             )
-        child = Child(name, popen, log)
+        child = Child(name, popen, log, wave)
         self._children.append(child)
         return child
 
@@ -106,21 +110,29 @@ class ProcessTree:
             time.sleep(0.02)
 
     def stop(self) -> list[str]:
-        """SIGTERM in reverse order of start, SIGKILL after a deadline; returns the names that had to be killed."""
+        """Stop the waves from the highest on; returns the names of children that had to be killed."""
         killed: list[str] = []
-        for child in reversed(self._children):
-            if child.popen.poll() is None:
-                child.popen.send_signal(signal.SIGTERM)
-        deadline = time.monotonic() + STOP_DEADLINE_S
-        for child in reversed(self._children):
-            try:
-                child.popen.wait(max(0.1, deadline - time.monotonic()))
-            except subprocess.TimeoutExpired:
-                child.popen.kill()
-                child.popen.wait()
-                killed.append(child.name)
+        for wave in sorted({child.wave for child in self._children}, reverse=True):
+            killed += _stop([child for child in self._children if child.wave == wave])
         self._children.clear()
         return killed
+
+
+def _stop(children: list[Child]) -> list[str]:
+    """SIGTERM to all of them, SIGKILL to those that are still there after the deadline."""
+    killed: list[str] = []
+    for child in children:
+        if child.popen.poll() is None:
+            child.popen.send_signal(signal.SIGTERM)
+    deadline_s = time.monotonic() + STOP_DEADLINE_S
+    for child in children:
+        try:
+            child.popen.wait(max(0.1, deadline_s - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            child.popen.kill()
+            child.popen.wait()
+            killed.append(child.name)
+    return killed
 
 
 class MemorySampler:

@@ -11,9 +11,9 @@ import pytest
 
 from echolume.demo.operator import Operator
 from echolume.demo.plans import plan_text
-from echolume.demo.report import table, verdict
 from echolume.processes import ProcessEndedError, ProcessTree, pss_kib
 from echolume.progress import Progress
+from echolume.report import table, verdict
 from echolume_messages.errors import ConfigError
 from echolume_messages.plan import expand, parse
 
@@ -36,7 +36,9 @@ def report() -> dict[str, Any]:
         "archive": {"acknowledged": 9, "found": 9, "bytes": 10},
         "points": {"stereo": 1, "active_left": 1, "active_right": 1, "ultrasonic": 1},
         "maps": {"hybrid": scores(0.9), "optical": scores(0.8), "ultrasonic": scores(0.1), "union": scores(0.7)},
-        "timing": {"total_s": 1.0, "optical_pass_s": 0.5, "ultrasonic_pass_s": 0.5, "processing_lag_p99_ms": None},
+        "timing": {"total_s": 1.0, "optical_pass_s": 0.5, "ultrasonic_pass_s": 0.5, "processing_lag_p99_ms": 2.0},
+        "cells": {"matte": 5, "unknown": 1},
+        "resources": {"peak_pss_mib": 12.0},
         "digest": {"hybrid": "abc"},
     }  # fmt: skip
 

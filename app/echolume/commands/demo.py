@@ -42,9 +42,9 @@ def run(args: argparse.Namespace) -> int:
     """Run the demo; 0 only if the ledger closes, the archive is whole and the map beats each sensor alone."""
     signal.signal(signal.SIGTERM, _terminate)
     signal.signal(signal.SIGHUP, _terminate)
-    from echolume.demo.report import table, verdict
     from echolume.demo.run import DemoSettings, run_demo
     from echolume.progress import Progress
+    from echolume.report import table, verdict
 
     settings = DemoSettings(args.out, args.seed, args.speed, args.scene, args.pulse, args.plan)
     report = run_demo(settings, Progress())

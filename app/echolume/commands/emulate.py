@@ -43,8 +43,9 @@ def run(args: argparse.Namespace) -> int:
     signal.signal(signal.SIGTERM, end)
     signal.signal(signal.SIGINT, end)
     from echolume_drivers.emulated.rig import EmulatedRig
+    from echolume_messages.files import make_folder
 
-    out: Path = args.out
+    out: Path = make_folder(args.out)
     with EmulatedRig(args.seed, args.scene, args.speed, args.pulse, out, bare=args.bare) as rig:
         sys.stdout.write(
             f"emulated rig {rig.rig.name} is ready: {rig.rig_file}\n"
@@ -55,4 +56,6 @@ def run(args: argparse.Namespace) -> int:
         sys.stdout.flush()
         while not stop.is_set() and not rig.wait(0.1):
             pass
+        left_on = rig.stage.laser_on
+    sys.stdout.write(f"emulated rig ended; its hosts left the laser {'ON: switched off now' if left_on else 'off'}\n")
     return 0

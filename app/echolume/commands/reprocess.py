@@ -3,7 +3,7 @@
 example:
   echolume reprocess demo-out/raw.mcap --out again
 
-Writes hybrid.rrd, hybrid.ply, map.npz and figures/ to --out, by default `reprocessed` beside the archive.
+Writes hybrid.rrd, hybrid.ply, map.npz, report.json and figures/ to --out, by default `reprocessed` beside the archive.
 """
 
 from __future__ import annotations
@@ -12,12 +12,8 @@ import argparse
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from echolume.progress import Progress
-
-if TYPE_CHECKING:
-    from echolume_processing.session import Results
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -29,6 +25,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Reprocess the archive and print what came out."""
+    from echolume.report import table, write
+    from echolume.results import scan_report
     from echolume_processing.session import reprocess
 
     archive: Path = args.archive
@@ -36,21 +34,9 @@ def run(args: argparse.Namespace) -> int:
     progress = Progress()
     progress.say(f"reading {archive}")
     results = reprocess(archive, out, progress.count)
-    sys.stdout.write(json.dumps(results, indent=1) + "\n" if args.json else table(results, out))
+    report = scan_report(archive, results)
+    write(report, out)
+    sys.stdout.write(json.dumps(report, indent=1) + "\n" if args.json else "\n" + table(report))
+    if not args.json:
+        sys.stdout.write(f"\nResults are in {out}: {', '.join(results['files'])}, report.json\n")
     return 0
-
-
-def table(results: Results, out: Path) -> str:
-    """The results as text for people."""
-    rows = [
-        ("scan", results["scan"]),
-        *((f"{name.replace('_', ' ')} points", str(count)) for name, count in results["points"].items()),
-        *((f"{name} cells", str(count)) for name, count in results["cells"].items()),
-        ("registration", f"{results['registration']['dz_mm']:+.3f} mm"),
-        ("residual", f"{results['registration']['residual_db']:.1f} dB"),
-        ("digest", results["digest"]),
-        ("files", f"{out}: {', '.join(results['files'])}"),
-        *(("note", note) for note in results["notes"]),
-    ]
-    width = max(len(name) for name, _ in rows)
-    return "".join(f"{name:<{width}}  {value}\n" for name, value in rows)

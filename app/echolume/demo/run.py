@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,19 +13,23 @@ import msgspec
 
 from echolume.demo.operator import Operator
 from echolume.demo.plans import plan_text
-from echolume.demo.report import Report
-from echolume.demo.results import Passes, archive_row, ledger_rows, score_maps
+from echolume.demo.timing import Passes
 from echolume.processes import ProcessEndedError, ProcessTree
 from echolume.progress import Progress
+from echolume.report import Report, write
+from echolume.results import scan_report, score_maps
 from echolume_daemon.client import ScanClient
 from echolume_drivers.emulated.control import Control
+from echolume_drivers.emulated.scene import SCENES
 from echolume_messages import calibration as calibration_file
 from echolume_messages import plan as plans
 from echolume_messages import rig as rig_file
 from echolume_messages import topics
 from echolume_messages.bus import Bus, connect
 from echolume_messages.calibration import Calibration
-from echolume_messages.errors import IncompleteScanError
+from echolume_messages.errors import ConfigError, IncompleteScanError
+from echolume_messages.files import make_folder, read_text
+from echolume_messages.plan import Plan
 from echolume_messages.rig import Rig
 
 START_TIMEOUT_S = 90.0
@@ -67,29 +69,24 @@ def run_demo(settings: DemoSettings, progress: Progress) -> Report:
     EcholumeError
         A process ended, the calibration was rejected, or the scan is incomplete.
     """
-    out = settings.out.resolve()
-    out.mkdir(parents=True, exist_ok=True)
-    text = settings.plan.read_text(encoding="utf-8") if settings.plan else plan_text("demo")
+    text = read_text(settings.plan, "the plan") if settings.plan else plan_text("demo")
     plan = plans.parse(text, str(settings.plan or "demo.toml"))
+    _check(settings, plan)
+    out = make_folder(settings.out).resolve()
     progress.say("starting the emulated rig, the rig's services and the lab's subscribers")
     with ProcessTree(out / "logs") as tree, running_rig(settings, out, tree) as rig:
         started_s = time.monotonic()
-        calibration, calibration_report = _calibrate(rig, out, progress)
+        calibration = _calibrate(rig, out, progress)
         rig.control.place_scene(settings.scene)
         passes = Passes()
-        ledger, done = _scan(rig, text, calibration, out, progress, passes)
+        done = _scan(rig, text, calibration, out, progress, passes)
         truth = out / "truth.npz"
         rig.control.truth(truth)
         total_s = time.monotonic() - started_s
         progress.say("scoring the maps against the truth")
         report: Report = {
-            "version": version("echolume"),
-            "scan": ledger["scan"],
+            **scan_report(out / "raw.mcap", done),
             "seed": settings.seed,
-            "calibration": {"digest": calibration.digest, **calibration_report},
-            "ledger": ledger_rows(ledger),
-            "archive": archive_row(out / "raw.mcap", ledger),
-            "points": done["points"],
             "maps": score_maps(out / "map.npz", truth, plan.map),
             "timing": {
                 "total_s": total_s,
@@ -98,12 +95,34 @@ def run_demo(settings: DemoSettings, progress: Progress) -> Report:
                 "processing_lag_p99_ms": done["lag_p99_ms"],
             },
             "resources": {"peak_pss_mib": tree.peak_pss_mib},
-            "digest": {"hybrid": done["digest"]},
             "unprocessed": done["missing"],
-            "notes": done.get("notes", []),
         }
-    (out / "report.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    write(report, out)
     return report
+
+
+def _check(settings: DemoSettings, plan: Plan) -> None:
+    """Refuse at once what would fail after the calibration only."""
+    if settings.scene not in SCENES:
+        raise ConfigError(f"--scene {settings.scene}: unknown; known: {', '.join(SCENES)}")
+    if not settings.speed > 0:
+        raise ConfigError(f"--speed {settings.speed:g}: must be above 0")
+    kinds = {step.kind for step in plans.expand(plan)}
+    if not {"optical", "ultrasonic"} <= kinds:
+        raise ConfigError(
+            f"{settings.plan}: the demo compares light with sound; its plan needs an optical and an ultrasonic pass"
+        )
+    for item in plan.passes:
+        if item.prompt:
+            Operator(_Nobody()).answer(item.prompt)
+
+
+class _Nobody:
+    """Places nothing: to ask whether a prompt is understood."""
+
+    def place_scene(self, name: str, /) -> None: ...
+
+    def place_board(self, pose: int, /) -> None: ...
 
 
 @contextmanager
@@ -117,9 +136,9 @@ def running_rig(settings: DemoSettings, out: Path, tree: ProcessTree) -> Generat
     tree.wait_until(rig_path.exists, "the emulated rig", START_TIMEOUT_S)
     rig = rig_file.load(rig_path)
     for name in topics.SERVICES:
-        tree.start(name, ["serve", name, "--rig", str(rig_path)])
+        tree.start(name, ["serve", name, "--rig", str(rig_path)], wave=1 if name == "router" else 2)
     for name in topics.SUBSCRIBERS:
-        tree.start(name, ["process", name, "--rig", str(rig_path), "--out", str(out)])
+        tree.start(name, ["process", name, "--rig", str(rig_path), "--out", str(out)], wave=3)
     wanted = {*topics.SERVICES[1:], *topics.SUBSCRIBERS}
     with (
         connect(rig.bus.endpoint, rig.name, timeout_s=START_TIMEOUT_S) as bus,
@@ -158,21 +177,19 @@ def _run_plan(
     return ledger
 
 
-def _calibrate(rig: RunningRig, out: Path, progress: Progress) -> tuple[Calibration, Json]:
+def _calibrate(rig: RunningRig, out: Path, progress: Progress) -> Calibration:
     progress.say("calibrating: boards, stripes on boards, tilted poses over the plate, the block")
     archive = out / "calibration.mcap"
     _run_plan(rig, plan_text("calibrate"), archive, None, progress)
     from echolume_processing.calibrate_rig import calibrate_rig
 
     progress.say("working out the calibration")
-    calibration, figures = calibrate_rig(archive, rig.rig.name, rig.rig.array)
+    calibration, _ = calibrate_rig(archive, rig.rig.name, rig.rig.array)
     calibration_file.save(calibration, out / "calibration.json")
-    return calibration, figures
+    return calibration
 
 
-def _scan(
-    rig: RunningRig, text: str, calibration: Calibration, out: Path, progress: Progress, passes: Passes
-) -> tuple[Json, Json]:
+def _scan(rig: RunningRig, text: str, calibration: Calibration, out: Path, progress: Progress, passes: Passes) -> Json:
     progress.say("scanning: light, then sound")
     with rig.bus.subscribe([topics.HYBRID_DONE], depth=8) as done:
         ledger = _run_plan(rig, text, out / "raw.mcap", calibration, progress, passes)
@@ -182,5 +199,5 @@ def _scan(
             rig.tree.check()
             message = done.get(0.5)
             if message is not None and (found := cast("Json", message.json()))["scan"] == ledger["scan"]:
-                return ledger, found
+                return found
     raise ProcessEndedError(f"hybrid: no map after {MAP_TIMEOUT_S:.0f} s; see {out / 'logs' / 'hybrid.log'}")

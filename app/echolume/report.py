@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import math
+from pathlib import Path
 from typing import Any, cast
 
 Report = dict[str, Any]
+
+
+def write(report: Report, out: Path) -> None:
+    """Write report.json into a folder."""
+    (out / "report.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
 
 
 def verdict(report: Report) -> list[str]:
@@ -22,7 +29,7 @@ def verdict(report: Report) -> list[str]:
                 f"duplicate {row['duplicate']}, extra {row['extra']}"
             )
     archive = report["archive"]
-    if archive["found"] < archive["acknowledged"]:
+    if archive["found"] < (archive["acknowledged"] or 0):
         reasons.append(f"archive: {archive['acknowledged']} records acknowledged, {archive['found']} found")
     reasons.extend(
         f"map: made without {len(triggers)} triggers of pass {name!r} that never reached it"
@@ -72,8 +79,10 @@ def table(report: Report) -> str:
         f"Archive: {archive['acknowledged']} records acknowledged, {archive['found']} found, "
         f"{archive['bytes'] / 1e6:.0f} MB"
     )
+    cells = ", ".join(f"{name} {n}" for name, n in report["cells"].items())
     points = ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in report["points"].items())
     lines.append(f"Points: {points}")
+    lines.append(f"Cells: {cells}")
     if report.get("maps"):
         columns = [
             "f1_at_0p5mm",
@@ -87,15 +96,16 @@ def table(report: Report) -> str:
         lines.append("")
         lines += _table(["map", *columns], [[n, *(r.get(c) for c in columns)] for n, r in report["maps"].items()])
     lines.append("")
-    timing = report["timing"]
-    resources = report.get("resources", {})
-    lag = timing["processing_lag_p99_ms"]
-    lines.append(
-        f"Time: {timing['total_s']:.0f} s in all (light {timing['optical_pass_s']:.0f} s, "
-        f"sound {timing['ultrasonic_pass_s']:.0f} s)"
-        + (f", processing lag p99 {lag:.0f} ms" if lag is not None else "")
-        + (f", memory at most {resources['peak_pss_mib']:.0f} MiB" if "peak_pss_mib" in resources else "")
-    )
+    if "timing" in report:
+        lines.append(_timing(report["timing"], report["resources"]["peak_pss_mib"]))
     lines.append(f"Digest of the hybrid map: {report['digest']['hybrid']}")
     lines.extend(f"Note: {note}" for note in report.get("notes", []))
     return "\n".join(lines) + "\n"
+
+
+def _timing(timing: dict[str, float], peak_pss_mib: float) -> str:
+    return (
+        f"Time: {timing['total_s']:.0f} s from calibration to map (light {timing['optical_pass_s']:.0f} s, sound "
+        f"{timing['ultrasonic_pass_s']:.0f} s), processing lag p99 {timing['processing_lag_p99_ms']:.0f} ms, memory at "
+        f"most {peak_pss_mib:.0f} MiB"
+    )

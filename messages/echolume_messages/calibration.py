@@ -9,7 +9,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from echolume_messages.errors import CalibrationMissingError
+from echolume_messages.errors import CalibrationError, CalibrationMissingError
+from echolume_messages.files import replace_bytes
 
 Vector3 = tuple[float, float, float]
 Rows = list[list[float]]
@@ -122,5 +123,14 @@ def load(path: Path, rig: str | None = None) -> Calibration:
 
 
 def save(calibration: Calibration, path: Path) -> None:
-    """Write a calibration file, readable by people."""
-    path.write_bytes(msgspec.json.format(msgspec.json.encode(calibration), indent=1))
+    """Write a calibration file, readable by people.
+
+    Raises
+    ------
+    CalibrationError
+        The disk does not take it; a calibration that was there is unchanged.
+    """
+    try:
+        replace_bytes(path, msgspec.json.format(msgspec.json.encode(calibration), indent=1))
+    except OSError as error:
+        raise CalibrationError(f"{path}: cannot write the calibration: {error.strerror}") from error

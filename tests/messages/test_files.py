@@ -118,7 +118,7 @@ def test_the_plans_that_come_with_it_are_valid(path: Path) -> None:
         ("pitch_mm = 0.5", "pich_mm = 0.5", r"plan\.toml: .*`(pich_mm|pitch_mm)`.*\$\.pass\[0\]"),
         ("pitch_mm = 0.5", "", r"missing required field `pitch_mm`.*\$\.pass\[0\]"),
         ("pitch_mm = 0.5", 'pitch_mm = "fine"', r"\$\.pass\[0\]\.pitch_mm"),
-        ("pitch_mm = 0.5", "pitch_mm = 0.0", "pitch_mm must be above 0"),
+        ("pitch_mm = 0.5", "pitch_mm = 0.0", r"plan\.toml: .*> 0\.0 - at `\$\.pass\[0\]\.pitch_mm"),
         ("stop_mm = 10.0", "stop_mm = -11.0", "before it starts"),
         ('kind = "optical"', 'kind = "magnetic"', r"magnetic.*\$\.pass\[0\]\.kind"),
         ('name = "p"', 'name = "p"\ncolour = 1', "unknown field `colour`"),

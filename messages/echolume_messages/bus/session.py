@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import zenoh
 
@@ -43,6 +44,11 @@ def _settings(shared_memory: bool, client: bool) -> dict[str, object]:
     }
 
 
+def _reason(error: zenoh.ZError) -> str:
+    """What zenoh says, without the places in its source."""
+    return re.sub(r" at /\S+\.rs:\d+\.?", "", str(error))
+
+
 def open_client(endpoint: str, timeout_s: float, shared_memory: bool) -> zenoh.Session:
     """Session of a client of the router at `endpoint`; it reconnects by itself when the router comes back.
 
@@ -61,7 +67,7 @@ def open_client(endpoint: str, timeout_s: float, shared_memory: bool) -> zenoh.S
     except zenoh.ZError as error:
         raise RouterUnreachableError(
             f"no router at {endpoint} within {timeout_s:g} s: is `echolume serve router` running, "
-            f"and is the endpoint of the rig file the right one? ({error})"
+            f"and is the endpoint of the rig file the right one? ({_reason(error)})"
         ) from error
 
 
@@ -82,5 +88,5 @@ def open_router_session(endpoint: str, shared_memory: bool) -> zenoh.Session:
         return zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
     except zenoh.ZError as error:
         raise RouterUnreachableError(
-            f"the router cannot listen on {endpoint}: is another router running, or the port in use? ({error})"
+            f"the router cannot listen on {endpoint}: is another router running, or the port in use? ({_reason(error)})"
         ) from error

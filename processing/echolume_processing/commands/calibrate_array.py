@@ -10,7 +10,7 @@ import json
 import sys
 from pathlib import Path
 
-from echolume_messages.rig import Rig
+from echolume_messages.rig_option import add_rig, load_rig
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -20,16 +20,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--into", type=Path, required=True, metavar="FILE", help="calibration file whose array part to replace"
     )
-    parser.add_argument("--rig", type=Path, metavar="FILE", help="rig file (default: $ECHOLUME_RIG or /etc/echolume)")
+    add_rig(parser)
     parser.add_argument("--json", action="store_true", help="print the figures as JSON")
-
-
-def _rig(path: Path | None) -> Rig:
-    import os
-
-    from echolume_messages import rig as rig_file
-
-    return rig_file.load(path or Path(os.environ.get("ECHOLUME_RIG", "") or "/etc/echolume/rig.toml"))
 
 
 def run(args: argparse.Namespace) -> int:
@@ -38,10 +30,12 @@ def run(args: argparse.Namespace) -> int:
     import numpy as np
 
     from echolume_messages import calibration as calibration_file
+    from echolume_messages.files import require_place
     from echolume_processing.ultrasonic.from_archive import calibrate_array_from_archive
 
-    rig = _rig(args.rig)
+    rig = load_rig(args.rig)
     before = calibration_file.load(args.into, rig.name)
+    require_place(args.into, "--into")
     result = calibrate_array_from_archive(args.archive, before.left, before.right, before.laser, rig.array)
     calibration_file.save(msgspec.structs.replace(before, array=result.calibration), args.into)
     plate, block = result.plate, result.block

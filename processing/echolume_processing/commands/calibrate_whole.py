@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 from pathlib import Path
+
+from echolume_messages.rig_option import add_rig, load_rig
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -17,23 +18,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.description = __doc__
     parser.add_argument("archive", type=Path, help="archive (.mcap) of a scan of the plan calibrate.toml")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="calibration file to write")
-    parser.add_argument(
-        "--rig",
-        type=Path,
-        default=Path(os.environ.get("ECHOLUME_RIG", "") or "/etc/echolume/rig.toml"),
-        metavar="FILE",
-        help="rig file (default: $ECHOLUME_RIG, else /etc/echolume/rig.toml)",
-    )
+    add_rig(parser)
     parser.add_argument("--json", action="store_true", help="print the figures as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Calibrate, write the calibration file, and report."""
     from echolume_messages import calibration as calibration_file
-    from echolume_messages import rig as rig_file
+    from echolume_messages.files import require_place
     from echolume_processing.calibrate_rig import calibrate_rig
 
-    rig = rig_file.load(args.rig)
+    rig = load_rig(args.rig)
+    require_place(args.out)
     calibration, figures = calibrate_rig(args.archive, rig.name, rig.array)
     calibration_file.save(calibration, args.out)
     if args.json:

@@ -31,12 +31,12 @@ class Progress:
         self._last_s = time.monotonic()
 
     def count(self, what: str, done: int, total: int) -> None:
-        """How much of the present step is done."""
+        """How much of the present step is done; a `total` of 0 is unknown."""
         now_s = time.monotonic()
         if now_s - self._last_s < (0.1 if self._live else self._every_s):
             return
         self._last_s = now_s
-        text = f"[{self.elapsed_s:5.1f} s]   {what}: {done}/{total}"
+        text = f"[{self.elapsed_s:5.1f} s]   {what}: {done}{f'/{total}' if total else ''}"
         self._stream.write(f"\r{text:<78}" if self._live else f"{text}\n")
         self._open = self._live
         self._stream.flush()

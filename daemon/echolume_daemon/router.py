@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import threading
 
-from echolume_daemon.service import Json, Service, load_rig, run_service
+from echolume_daemon.service import Json, Service, run_service
 from echolume_messages.bus import Bus
 from echolume_messages.bus.router import open_router
 from echolume_messages.rig import Rig
+from echolume_messages.rig_option import load_rig
 
 
 class RouterPart:

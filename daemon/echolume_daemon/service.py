@@ -4,30 +4,26 @@ from __future__ import annotations
 
 import logging
 import os
-import signal
 import threading
 import time
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
-from types import FrameType
 from typing import Protocol, TypeAlias
 
 from echolume_daemon.notify import notify, watchdog_period_s
-from echolume_messages import rig as rig_file
-from echolume_messages.bus import Bus, connect
+from echolume_messages.bus import Bus
+from echolume_messages.bus.lifetime import connect_when_up, stopped_by_signals
 from echolume_messages.errors import EcholumeError, RouterUnreachableError
 from echolume_messages.rig import Rig
+from echolume_messages.rig_option import load_rig
 from echolume_messages.topics import BY_NAME, health
 
 Json: TypeAlias = dict[str, object]
 Handler: TypeAlias = Callable[[Json], Json]
 
-DEFAULT_RIG = "/etc/echolume/rig.toml"
 _HEALTH_PERIOD_S = 1.0
 _TICK_S = 0.1
-_BACK_OFF_S = (0.1, 2.0)
 
 
 @dataclass
@@ -150,11 +146,6 @@ class Service:
                 self.log.warning("loop %s did not stop within %.1f s", thread.name, timeout_s)
 
 
-def load_rig(path: Path | str | None = None) -> Rig:
-    """Read the rig file: `path`, else ``$ECHOLUME_RIG``, else /etc/echolume/rig.toml."""
-    return rig_file.load(Path(path or os.environ.get("ECHOLUME_RIG", "") or DEFAULT_RIG))
-
-
 def run_service(
     name: str,
     make: Callable[[Service], Part],
@@ -180,14 +171,14 @@ def run_service(
     Returns
     -------
     int
-        Exit code: 0 after an ordinary stop, 1 after a failure (which is logged).
+        Exit code: 0 after an ordinary stop, after a failure (which is logged) the error's own, or 1.
     """
     rig = rig or load_rig()
     stop = stop or threading.Event()
-    with _signals(stop):
+    with stopped_by_signals(stop):
         if bus is not None:
             return _run(Service(name, rig, bus, stop), make)
-        own = _connect(name, rig, stop)
+        own = connect_when_up(rig, stop, lambda error: _waiting(name, rig, error))
         if own is None:
             return 0
         with own:
@@ -212,7 +203,7 @@ def _run(service: Service, make: Callable[[Service], Part]) -> int:
         service.join()
     if service.failure is not None:
         service.log.error("stopped: %s", service.failure, exc_info=_trace(service.failure))
-        return 1
+        return service.failure.exit_code if isinstance(service.failure, EcholumeError) else 1
     service.log.info("stopped")
     return 0
 
@@ -238,46 +229,9 @@ def _watch(service: Service, part: Part) -> None:
             next_health_s = now_s + _HEALTH_PERIOD_S
 
 
-def _connect(name: str, rig: Rig, stop: threading.Event) -> Bus | None:
-    """Connect to the router, however long it takes to come up; None if stopped before."""
-    wait_s, longest_s = _BACK_OFF_S
-    said = False
-    while not stop.is_set():
-        try:
-            return connect(
-                rig.bus.endpoint,
-                rig.name,
-                timeout_s=1.0,
-                shared_memory=rig.bus.shared_memory,
-                journal_s=rig.bus.journal_s,
-                journal_mib=rig.bus.journal_mib,
-            )
-        except RouterUnreachableError as error:
-            if not said:
-                logging.getLogger(f"echolume.{name}").warning("waiting for the router: %s", error)
-                notify(f"STATUS=waiting for the router at {rig.bus.endpoint}")
-                said = True
-        stop.wait(wait_s)
-        wait_s = min(2 * wait_s, longest_s)
-    return None
-
-
-@contextmanager
-def _signals(stop: threading.Event) -> Generator[None]:
-    """SIGTERM and SIGINT set `stop`; only the main thread may install handlers."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def handle(_number: int, _frame: FrameType | None) -> None:
-        stop.set()
-
-    before = {number: signal.signal(number, handle) for number in (signal.SIGTERM, signal.SIGINT)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+def _waiting(name: str, rig: Rig, error: RouterUnreachableError) -> None:
+    logging.getLogger(f"echolume.{name}").warning("waiting for the router: %s", error)
+    notify(f"STATUS=waiting for the router at {rig.bus.endpoint}")
 
 
 def _trace(error: BaseException) -> BaseException | None:

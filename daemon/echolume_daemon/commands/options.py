@@ -3,21 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import os
 from pathlib import Path
 
 from echolume_daemon.client import default_holder
-from echolume_daemon.service import DEFAULT_RIG, load_rig
 from echolume_messages.bus import Bus, connect
 from echolume_messages.rig import Rig
-
-
-def add_rig(parser: argparse.ArgumentParser) -> None:
-    """``--rig FILE``."""
-    given = os.environ.get("ECHOLUME_RIG", "") or DEFAULT_RIG
-    parser.add_argument(
-        "--rig", type=Path, default=Path(given), metavar="FILE", help=f"rig file (default: $ECHOLUME_RIG, or {given})"
-    )
+from echolume_messages.rig_option import load_rig
 
 
 def add_holder(parser: argparse.ArgumentParser) -> None:
@@ -30,4 +21,9 @@ def add_holder(parser: argparse.ArgumentParser) -> None:
 def join(path: Path) -> tuple[Rig, Bus]:
     """Read the rig file and connect to its bus."""
     rig = load_rig(path)
-    return rig, connect(rig.bus.endpoint, rig.name, shared_memory=rig.bus.shared_memory)
+    return rig, join_bus(rig)
+
+
+def join_bus(rig: Rig) -> Bus:
+    """Connect to the bus of a rig."""
+    return connect(rig.bus.endpoint, rig.name, shared_memory=rig.bus.shared_memory)

@@ -7,7 +7,8 @@ import json
 import sys
 
 from echolume_daemon.client import ScanClient
-from echolume_daemon.commands.options import add_holder, add_rig, join
+from echolume_daemon.commands.options import add_holder, join
+from echolume_messages.rig_option import add_rig
 
 
 def configure_order(parser: argparse.ArgumentParser) -> None:

@@ -18,11 +18,16 @@ from pathlib import Path
 from types import FrameType
 from typing import cast
 
+import msgspec
+
 from echolume_daemon.client import Json, ScanClient
-from echolume_daemon.commands.options import add_holder, add_rig, join
+from echolume_daemon.commands.options import add_holder, join_bus
 from echolume_messages import calibration as calibration_file
-from echolume_messages.errors import ConfigError, IncompleteScanError
+from echolume_messages import plan as plan_file
+from echolume_messages.errors import IncompleteScanError
+from echolume_messages.files import make_folder, read_text
 from echolume_messages.rig import Rig
+from echolume_messages.rig_option import add_rig, load_rig
 
 COLUMNS = ("planned", "fired", "matched", "missing", "duplicate", "extra")
 
@@ -38,18 +43,17 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Start the scan, follow it, print its ledger."""
-    try:
-        plan_text = args.plan.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{args.plan}: cannot read the plan: {error.strerror}") from error
-    rig, bus = join(args.rig)
-    archive = _archive(args.out)
+    plan_text = read_text(args.plan, "the plan")
+    plan_file.parse(plan_text, str(args.plan))  # the conductor checks it too, but does not know the file's name
+    rig = load_rig(args.rig)
+    calibration = _calibration(rig)
     stop = threading.Event()
-    with bus:
+    with join_bus(rig) as bus:
+        archive = _archive(args.out)
         client = ScanClient(bus, args.holder)
         before = signal.signal(signal.SIGINT, lambda _n, _f: stop.set())
         try:
-            scan = client.start(plan_text, archive=archive, calibration=_calibration(rig))
+            scan = client.start(plan_text, archive=archive, calibration=calibration)
             sys.stderr.write(f"scan {scan}\n")
             ledger = client.wait(Progress().show, lambda text: _ask(text, stop), stop)
         finally:
@@ -63,16 +67,14 @@ def run(args: argparse.Namespace) -> int:
 def _archive(out: Path | None) -> str:
     if out is None:
         return ""
-    out.mkdir(parents=True, exist_ok=True)
-    return str(out.resolve() / "raw.mcap")
+    return str(make_folder(out).resolve() / "raw.mcap")
 
 
 def _calibration(rig: Rig) -> Json | None:
     if not rig.calibration:
         return None
     path = Path(rig.calibration)
-    calibration_file.load(path, rig.name)
-    return cast(Json, json.loads(path.read_text(encoding="utf-8")))
+    return cast(Json, msgspec.to_builtins(calibration_file.load(path, rig.name)))
 
 
 def _ask(text: str, stop: threading.Event) -> None:

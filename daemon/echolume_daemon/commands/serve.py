@@ -9,8 +9,7 @@ from __future__ import annotations
 import argparse
 from importlib import import_module
 
-from echolume_daemon.commands.options import add_rig
-from echolume_daemon.service import load_rig
+from echolume_messages.rig_option import add_rig, load_rig
 from echolume_messages.topics import SERVICES
 
 

@@ -11,9 +11,10 @@ import json
 import sys
 from typing import cast
 
-from echolume_daemon.commands.options import add_rig, join
+from echolume_daemon.commands.options import join
 from echolume_messages.bus import Bus
 from echolume_messages.errors import EcholumeError
+from echolume_messages.rig_option import add_rig
 from echolume_messages.topics import SERVICES
 
 Json = dict[str, object]

@@ -10,29 +10,24 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import os
 from pathlib import Path
 
-from echolume_messages import rig as rig_file
 from echolume_messages import topics
-
-DEFAULT_RIG = "/etc/echolume/rig.toml"
+from echolume_messages.files import make_folder
+from echolume_messages.rig_option import add_rig, load_rig
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     parser.add_argument("subscriber", choices=topics.SUBSCRIBERS)
-    parser.add_argument(
-        "--rig",
-        type=Path,
-        default=Path(os.environ.get("ECHOLUME_RIG", DEFAULT_RIG)),
-        help=f"the rig file (default: $ECHOLUME_RIG, else {DEFAULT_RIG})",
-    )
+    add_rig(parser)
     parser.add_argument("--out", type=Path, default=Path(), help="folder for the hybrid map (default: this folder)")
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the subscriber until SIGTERM or Ctrl-C."""
-    rig = rig_file.load(args.rig)
+    rig = load_rig(args.rig)
+    if args.subscriber == "hybrid":
+        make_folder(args.out)
     module = importlib.import_module(f"echolume_processing.subscribers.{args.subscriber}")
     return int(module.main(rig=rig, out=args.out))

@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import logging
 import os
-import signal
 import threading
 import time
-from collections.abc import Callable, Generator
-from contextlib import contextmanager
-from pathlib import Path
-from types import FrameType
+from collections.abc import Callable
 from typing import Protocol
 
-from echolume_messages import rig as rig_file
-from echolume_messages.bus import Bus, connect
-from echolume_messages.errors import EcholumeError, RouterUnreachableError
+from echolume_messages.bus import Bus
+from echolume_messages.bus.lifetime import connect_when_up, stopped_by_signals
+from echolume_messages.errors import EcholumeError
 from echolume_messages.rig import Rig
+from echolume_messages.rig_option import load_rig
 from echolume_messages.topics import health
 
-DEFAULT_RIG = "/etc/echolume/rig.toml"
 STEP_S = 0.2
 HEALTH_S = 1.0
 
@@ -58,7 +54,7 @@ def run_subscriber(
     bus
         A bus that somebody else owns; without one the subscriber connects, and waits for the router.
     rig
-        The rig; without one it is read from ``$ECHOLUME_RIG``, else /etc/echolume/rig.toml.
+        The rig; without one it is read from the default rig file.
     stop
         Ends the subscriber when set.
 
@@ -67,13 +63,13 @@ def run_subscriber(
     int
         0 after an ordinary stop, else the error's exit code; the error is logged.
     """
-    rig = rig or rig_file.load(Path(os.environ.get("ECHOLUME_RIG", "") or DEFAULT_RIG))
+    rig = rig or load_rig()
     stop = stop or threading.Event()
     log = logging.getLogger(f"echolume.{name}")
-    with _signals(stop):
+    with stopped_by_signals(stop):
         own = None
         if bus is None:
-            own = bus = _connect(rig, stop, log)
+            own = bus = connect_when_up(rig, stop, lambda error: log.warning("waiting for the router: %s", error))
         if bus is None:
             return 0
         try:
@@ -101,42 +97,3 @@ def _run(name: str, worker: Worker, bus: Bus, stop: threading.Event, log: loggin
                 next_s = time.monotonic() + HEALTH_S
     finally:
         worker.close()
-
-
-def _connect(rig: Rig, stop: threading.Event, log: logging.Logger) -> Bus | None:
-    """Connect to the router, however long it takes to come up; None if stopped before."""
-    said = False
-    while not stop.is_set():
-        try:
-            return connect(
-                rig.bus.endpoint,
-                rig.name,
-                timeout_s=2.0,
-                shared_memory=rig.bus.shared_memory,
-                journal_s=rig.bus.journal_s,
-                journal_mib=rig.bus.journal_mib,
-            )
-        except RouterUnreachableError as error:
-            if not said:
-                log.warning("waiting for the router: %s", error)
-                said = True
-        stop.wait(0.5)
-    return None
-
-
-@contextmanager
-def _signals(stop: threading.Event) -> Generator[None]:
-    """SIGTERM and SIGINT set `stop`; only the main thread may install handlers."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def handle(_number: int, _frame: FrameType | None) -> None:
-        stop.set()
-
-    before = {number: signal.signal(number, handle) for number in (signal.SIGTERM, signal.SIGINT)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import queue
 import secrets
-import socket
 import threading
 import time
 from collections.abc import Callable
@@ -31,15 +30,9 @@ from echolume_messages.rig import (
     TriggerSettings,
 )
 from echolume_messages.topics import CAMERA_LEFT, CAMERA_RIGHT, DURABLE, ECHOES, LEDGER, SCAN_START
+from loopback import free_endpoint
 
 DEADLINE_S = 20.0
-
-
-def free_endpoint() -> str:
-    """A loopback endpoint that nobody uses."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def make_rig(endpoint: str, directory: Path) -> Rig:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import socket
-import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -23,10 +21,8 @@ from echolume_drivers.emulated.optics import optical_truth
 from echolume_drivers.emulated.scene import plate
 from echolume_drivers.emulated.stripe_image import render_stripe
 from echolume_messages import plan as plans
-from echolume_messages import rig as rig_file
 from echolume_messages import topics
-from echolume_messages.bus import Bus, Message, connect
-from echolume_messages.bus.router import open_router
+from echolume_messages.bus import Bus, Message
 from echolume_messages.calibration import Calibration
 from echolume_messages.codec import json_array
 from echolume_messages.errors import ArchiveError, CalibrationMissingError
@@ -36,6 +32,7 @@ from echolume_messages.types import Label, Structured
 from echolume_processing.evidence import Evidence
 from echolume_processing.session import gather, reprocess
 from echolume_processing.subscribers import hybrid
+from loopback import lab_rig, running_subscriber
 from processing.hybrid_scan import TEMPERATURE_C, calibration_of
 from processing.test_optical_pipeline import camera_of, laser_of
 
@@ -197,46 +194,14 @@ def test_of_a_trigger_acquired_twice_the_later_attempt_counts(evidence: Evidence
 
 @pytest.fixture
 def rig() -> Rig:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    return rig_file.parse(
-        f"""
-        name = "test"
-        [bus]
-        endpoint = "tcp/127.0.0.1:{port}"
-        [guide]
-        port = "none"
-        [trigger]
-        port = "none"
-        [cameras.left]
-        address = "none"
-        [cameras.right]
-        address = "none"
-        [robot]
-        [array]
-        port = "none"
-        [recorder]
-        directory = "none"
-        """
-    )
+    return lab_rig()
 
 
 @pytest.fixture
 def live(rig: Rig, tmp_path: Path) -> Iterator[Bus]:
     """A router, the hybrid subscriber on it writing to tmp_path, and the bus of everybody else."""
-    stop = threading.Event()
-    codes: list[int] = []
-    with open_router(rig.bus.endpoint), connect(rig.bus.endpoint, rig.name) as bus:
-        thread = threading.Thread(target=lambda: codes.append(hybrid.main(rig=rig, out=tmp_path, stop=stop)))
-        thread.start()
-        deadline_s = time.monotonic() + DEADLINE_S
-        while "hybrid" not in bus.alive():
-            assert time.monotonic() < deadline_s, "the subscriber did not come up"
+    with running_subscriber("hybrid", rig, lambda stop: hybrid.main(rig=rig, out=tmp_path, stop=stop)) as bus:
         yield bus
-        stop.set()
-        thread.join(DEADLINE_S)
-    assert codes == [0]
 
 
 def put(bus: Bus, topic: topics.Topic, array: Structured, trigger: int, pass_name: str, source: Source) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import socket
-import threading
 import time
 from collections.abc import Callable, Iterator
 
@@ -14,16 +12,16 @@ import pytest
 from echolume_drivers.emulated.optics import optical_truth
 from echolume_drivers.emulated.scene import plate
 from echolume_drivers.emulated.stripe_image import render_stripe
-from echolume_messages import rig as rig_file
 from echolume_messages import topics
-from echolume_messages.bus import Bus, Message, connect
-from echolume_messages.bus.router import open_router
+from echolume_messages.bus import Bus, Message
 from echolume_messages.calibration import ArrayCalibration, Calibration
 from echolume_messages.errors import CalibrationMissingError
 from echolume_messages.header import Header, Source
 from echolume_messages.rig import Rig
 from echolume_processing.optical.pipeline import OpticalPipeline
 from echolume_processing.subscribers import optical
+from echolume_processing.subscribers.scans import read_start
+from loopback import lab_rig, running_subscriber
 from processing.test_optical_pipeline import camera_of, laser_of
 
 TRUTH = optical_truth(1)
@@ -50,46 +48,14 @@ def calibration(rig: str) -> Calibration:
 
 @pytest.fixture(scope="module")
 def rig() -> Rig:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    return rig_file.parse(
-        f"""
-        name = "test"
-        [bus]
-        endpoint = "tcp/127.0.0.1:{port}"
-        [guide]
-        port = "none"
-        [trigger]
-        port = "none"
-        [cameras.left]
-        address = "none"
-        [cameras.right]
-        address = "none"
-        [robot]
-        [array]
-        port = "none"
-        [recorder]
-        directory = "none"
-        """
-    )
+    return lab_rig()
 
 
 @pytest.fixture(scope="module")
 def stage(rig: Rig) -> Iterator[Bus]:
     """A router, the subscriber running on it, and the bus of the rig's side."""
-    stop = threading.Event()
-    codes: list[int] = []
-    with open_router(rig.bus.endpoint), connect(rig.bus.endpoint, rig.name) as bus:
-        thread = threading.Thread(target=lambda: codes.append(optical.main(rig=rig, stop=stop)))
-        thread.start()
-        deadline_s = time.monotonic() + DEADLINE_S
-        while "optical" not in bus.alive():
-            assert time.monotonic() < deadline_s, "the subscriber did not come up"
+    with running_subscriber("optical", rig, lambda stop: optical.main(rig=rig, stop=stop)) as bus:
         yield bus
-        stop.set()
-        thread.join(DEADLINE_S)
-    assert codes == [0]
 
 
 def pair(x_mm: float) -> tuple[np.ndarray, np.ndarray]:
@@ -172,9 +138,9 @@ def start_message(text: bytes) -> Message:
 def test_a_calibration_of_another_rig_is_refused() -> None:
     body = {"scan": "s", "plan": PLAN, "calibration": msgspec.to_builtins(calibration("other"))}
     with pytest.raises(CalibrationMissingError, match="of rig 'other', this is 'test'"):
-        optical.read_start(start_message(msgspec.json.encode(body)), "test")
+        read_start(start_message(msgspec.json.encode(body)), "test", OpticalPipeline)
 
 
 def test_a_start_that_cannot_be_read_is_named() -> None:
     with pytest.raises(CalibrationMissingError, match="conductor/start seq 3"):
-        optical.read_start(start_message(b'{"scan": 5}'), "test")
+        read_start(start_message(b'{"scan": 5}'), "test", OpticalPipeline)

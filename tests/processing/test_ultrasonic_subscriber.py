@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import socket
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,19 +14,19 @@ from echolume_drivers.emulated.array_truth import array_truth
 from echolume_drivers.emulated.echoes import simulate_ping
 from echolume_drivers.emulated.scene import plate
 from echolume_messages import archive, topics
-from echolume_messages import rig as rig_file
-from echolume_messages.bus import Bus, Message, connect
-from echolume_messages.bus.router import open_router
+from echolume_messages.bus import Bus, Message
 from echolume_messages.calibration import ArrayCalibration, Calibration, CameraCalibration, LaserCalibration
 from echolume_messages.errors import CalibrationMissingError, CalibrationRejectedError
 from echolume_messages.header import Header, Source
 from echolume_messages.rig import ArraySettings, Rig
 from echolume_processing.ping import Ping, ping_from_record
 from echolume_processing.subscribers import ultrasonic
+from echolume_processing.subscribers.scans import read_start
 from echolume_processing.ultrasonic import from_archive
 from echolume_processing.ultrasonic.calibrate import calibrate_plate
 from echolume_processing.ultrasonic.pipeline import UltrasonicPipeline
 from echolume_processing.ultrasonic.poses import plate_poses
+from loopback import lab_rig, running_subscriber
 
 DEADLINE_S = 20.0
 SETTINGS = ArraySettings(port="none")
@@ -60,46 +58,14 @@ def calibration(rig: str, array: ArrayCalibration) -> Calibration:
 
 @pytest.fixture(scope="module")
 def rig() -> Rig:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    return rig_file.parse(
-        f"""
-        name = "test"
-        [bus]
-        endpoint = "tcp/127.0.0.1:{port}"
-        [guide]
-        port = "none"
-        [trigger]
-        port = "none"
-        [cameras.left]
-        address = "none"
-        [cameras.right]
-        address = "none"
-        [robot]
-        [array]
-        port = "none"
-        [recorder]
-        directory = "none"
-        """
-    )
+    return lab_rig()
 
 
 @pytest.fixture(scope="module")
 def stage(rig: Rig) -> Iterator[Bus]:
     """A router, the subscriber running on it, and the bus of the rig's side."""
-    stop = threading.Event()
-    codes: list[int] = []
-    with open_router(rig.bus.endpoint), connect(rig.bus.endpoint, rig.name) as bus:
-        thread = threading.Thread(target=lambda: codes.append(ultrasonic.main(rig=rig, stop=stop)))
-        thread.start()
-        deadline_s = time.monotonic() + DEADLINE_S
-        while "ultrasonic" not in bus.alive():
-            assert time.monotonic() < deadline_s, "the subscriber did not come up"
+    with running_subscriber("ultrasonic", rig, lambda stop: ultrasonic.main(rig=rig, stop=stop)) as bus:
         yield bus
-        stop.set()
-        thread.join(DEADLINE_S)
-    assert codes == [0]
 
 
 def start_scan(bus: Bus, scan: str, found: Calibration | None) -> None:
@@ -172,11 +138,11 @@ def record(content: object) -> Message:
 def test_a_calibration_of_another_rig_or_without_templates_is_refused(array: ArrayCalibration):
     content = {"scan": "s", "calibration": msgspec.to_builtins(calibration("other", array))}
     with pytest.raises(CalibrationMissingError, match="of rig 'other'"):
-        ultrasonic.read_start(record(content), "test")
+        read_start(record(content), "test", UltrasonicPipeline)
     empty = msgspec.structs.replace(array, templates=[])
     content = {"scan": "s", "calibration": msgspec.to_builtins(calibration("test", empty))}
     with pytest.raises(CalibrationMissingError, match="unusable"):
-        ultrasonic.read_start(record(content), "test")
+        read_start(record(content), "test", UltrasonicPipeline)
 
 
 def test_a_record_without_a_pose_names_its_trigger():

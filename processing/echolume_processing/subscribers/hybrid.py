@@ -123,7 +123,7 @@ class HybridSubscriber:
         ledger = cast("Json", message.json())
         if not ledger.get("final", False):
             return
-        name = str(ledger["scan"])
+        name = message.header.scan
         if name not in self._scans:
             self._held_ledgers[name] = ledger
             if len(self._held_ledgers) > MAX_SCANS:
@@ -151,7 +151,11 @@ class HybridSubscriber:
         elif message.topic == topics.ULTRASONIC_POINTS and kind == "ultrasonic":
             scan.evidence.add_ultrasonic(*key, cast("Structured", message.payload))
         elif message.topic == topics.ECHOES and kind == "ultrasonic":
-            scan.evidence.add_ping(*key, ping_from_record(header, np.asarray(message.payload, dtype=np.int16)))
+            try:
+                scan.evidence.add_ping(*key, ping_from_record(header, np.asarray(message.payload, dtype=np.int16)))
+            except ValueError as error:
+                log.error("trigger %d: the ping is skipped: %s", header.trigger, error)
+                return
         else:
             return
         self._counts["records"] += 1
@@ -166,7 +170,14 @@ class HybridSubscriber:
         if missing:
             log.error("scan %s: %s did not arrive; the map is made without", name, missing)
         self._scans[name] = None
-        found, results = conclude(scan.evidence, self._out)
+        try:
+            found, results = conclude(scan.evidence, self._out)
+        except OSError as error:
+            log.error(
+                "scan %s: its map cannot be written to %s: %s; `echolume reprocess` makes it from the archive",
+                name, self._out, error.strerror,
+            )  # fmt: skip
+            return
         self._counts["maps"] += 1
         log.info("scan %s: map of %d cells, digest %s", name, found.cells.size, results["digest"])
         lag_ms = float(np.percentile(scan.lags_ms, 99)) if scan.lags_ms else 0.0

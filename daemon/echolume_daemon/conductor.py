@@ -205,8 +205,12 @@ class Conductor:
     def _listen(self, _loop: Loop) -> None:
         message = self._durable.get(0.2)
         run = self._run
-        if message is not None and run is not None:
+        if message is None or run is None:
+            return
+        try:
             run.acquisition.durable(cast(Json, message.json()))
+        except (TypeError, ValueError) as error:  # a stranger's: it must not end the scan
+            self._service.log.warning("a %s of another make is left out: %s", message.topic.name, error)
 
     def _tell(self, _loop: Loop) -> None:
         """Tell the state twice a second, so that who comes late knows it soon."""

@@ -98,13 +98,25 @@ class Cia402Robot:
             except (can.CanError, OSError) as error:
                 raise DeviceAbsentError(f"{self._where}: cannot open the CAN interface: {error}") from error
         try:
-            # python-can would try for ten seconds in a tight loop; ask first whether anybody is there
-            socket.create_connection((settings.host, settings.port), 1.0).close()
+            self._greet(settings.host, settings.port)
             return can.Bus(
                 interface="socketcand", channel=settings.channel, host=settings.host, port=settings.port, tcp_tune=True
             )
         except (can.CanError, OSError) as error:
             raise DeviceAbsentError(f"{self._where}: no socketcand server: {error}. Is it running?") from error
+
+    def _greet(self, host: str, port: int) -> None:
+        """See that a socketcand server answers: python-can would wait for ever for its first word."""
+        with socket.create_connection((host, port), 1.0) as probe:
+            try:
+                heard = probe.recv(256)
+            except TimeoutError:
+                heard = b""
+        if not heard.startswith(b"< hi"):
+            raise DeviceSilentError(
+                f"{self._where}: expected the greeting '< hi >' of a socketcand server within 1 s, got {heard!r}; "
+                "is the port in the rig file the right one?"
+            )
 
     def _command_network(self, network: canopen.Network, code: int, axis: RobotAxis) -> None:
         try:

@@ -35,6 +35,11 @@ class Topic:
         """``service/stream``, as in a header."""
         return f"{self.service}/{self.stream}"
 
+    @property
+    def is_json(self) -> bool:
+        """Whether the array is the UTF-8 text of a JSON object."""
+        return self.dtype == _U1 and len(self.shape) == 1
+
 
 _U1 = np.dtype("u1")
 _MIB = 1 << 20

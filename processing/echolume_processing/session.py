@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypedDict
@@ -11,7 +12,8 @@ import numpy as np
 from echolume_messages import archive as archives
 from echolume_messages import topics
 from echolume_messages.bus import Message
-from echolume_messages.errors import ArchiveError, CalibrationMissingError
+from echolume_messages.errors import ArchiveError, CalibrationError, CalibrationMissingError
+from echolume_messages.files import make_folder
 from echolume_processing import figures
 from echolume_processing.evidence import Evidence, ScanStart, read_start
 from echolume_processing.hybrid import ply, recording
@@ -23,6 +25,7 @@ from echolume_processing.optical.pipeline import OpticalPipeline
 from echolume_processing.ping import ping_from_record
 from echolume_processing.ultrasonic.pipeline import UltrasonicPipeline
 
+log = logging.getLogger("echolume.session")
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is (0: unknown)."""
 
@@ -62,18 +65,24 @@ def reprocess(archive: Path, out: Path, progress: Progress = silent) -> Results:
     CalibrationMissingError
         If the scan was made without a calibration.
     """
-    return conclude(gather(archive, progress), out, progress)[1]
-
-
-def gather(archive: Path, progress: Progress = silent) -> Evidence:
-    """Evidence of a scan from its raw archive."""
     start = _start(archive)
+    make_folder(out)
+    return conclude(gather(archive, progress, start), out, progress)[1]
+
+
+def gather(archive: Path, progress: Progress = silent, start: ScanStart | None = None) -> Evidence:
+    """Evidence of a scan from its raw archive."""
+    start = start or _start(archive)
     if start.calibration is None:
         raise CalibrationMissingError(
-            f"{archive}: scan {start.scan} was made without a calibration; run `echolume calibrate` first"
+            f"{archive}: scan {start.scan} was made without a calibration, so there is no map of it; calibrate the rig "
+            "(`echolume calibrate rig`), name the file in the rig file, and scan again"
         )
     evidence = Evidence(start.scan, start.plan, start.calibration)
-    optical, ultrasonic = OpticalPipeline(start.calibration), UltrasonicPipeline(start.calibration)
+    try:
+        optical, ultrasonic = OpticalPipeline(start.calibration), UltrasonicPipeline(start.calibration)
+    except ValueError as error:
+        raise CalibrationError(f"{archive}: the calibration of scan {start.scan} is unusable: {error}") from error
     kinds = {p.name: str(p.__struct_config__.tag) for p in start.plan.passes}
     halves: dict[tuple[int, int], Message] = {}
     wanted = (topics.CAMERA_LEFT, topics.CAMERA_RIGHT, topics.ECHOES)
@@ -83,9 +92,14 @@ def gather(archive: Path, progress: Progress = silent) -> Evidence:
             continue
         key = (header.trigger, header.attempt)
         if message.topic == topics.ECHOES and kinds.get(header.pass_name) == "ultrasonic":
-            ping = ping_from_record(header, np.asarray(message.payload, dtype=np.int16))
+            try:
+                ping = ping_from_record(header, np.asarray(message.payload, dtype=np.int16))
+                points = ultrasonic.process(ping)
+            except ValueError as error:
+                log.warning("%s: trigger %d: the ping is skipped: %s", archive, header.trigger, error)
+                continue
             evidence.add_ping(*key, ping)
-            evidence.add_ultrasonic(*key, ultrasonic.process(ping))
+            evidence.add_ultrasonic(*key, points)
             progress("pings", len(evidence.pings), 0)
         elif message.topic != topics.ECHOES and kinds.get(header.pass_name) == "optical":
             other = halves.pop(key, None)
@@ -93,11 +107,12 @@ def gather(archive: Path, progress: Progress = silent) -> Evidence:
                 halves[key] = message
                 continue
             left, right = (message, other) if message.topic == topics.CAMERA_LEFT else (other, message)
-            x_mm = left.header.source.x_mm
-            if x_mm is None:
-                raise ArchiveError(f"{archive}: trigger {header.trigger}: the left frame carries no guide position")
             frames = np.asarray(left.payload, dtype=np.uint8), np.asarray(right.payload, dtype=np.uint8)
-            evidence.add_optical(*key, optical.process(*frames, x_mm))
+            try:
+                evidence.add_optical(*key, optical.process(*frames, _guide_x_mm(left)))
+            except ValueError as error:
+                log.warning("%s: trigger %d: the stripe is skipped: %s", archive, header.trigger, error)
+                continue
             progress("stripes", len(evidence.optical), 0)
     return evidence
 
@@ -152,8 +167,20 @@ def save_maps(found: HybridMap, others: Baselines, path: Path) -> None:
         )
 
 
+def _guide_x_mm(left: Message) -> float:
+    x_mm = left.header.source.x_mm
+    if x_mm is None:
+        raise ValueError("the left frame carries no guide position")
+    return x_mm
+
+
 def _start(archive: Path) -> ScanStart:
     """The start of the scan that an archive holds."""
     for message in archives.read(archive, [topics.SCAN_START.name]):
-        return read_start(message)
+        try:
+            return read_start(message)
+        except CalibrationMissingError as error:
+            raise CalibrationMissingError(f"{archive}: {error}") from error
+    if not archives.summary(archive).records:
+        raise ArchiveError(f"{archive}: is empty, or cut before its first whole chunk: nothing can be read from it")
     raise ArchiveError(f"{archive}: holds no {topics.SCAN_START.name}; it is no archive of a scan")

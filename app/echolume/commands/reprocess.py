@@ -36,6 +36,10 @@ def run(args: argparse.Namespace) -> int:
     results = reprocess(archive, out, progress.count)
     report = scan_report(archive, results)
     write(report, out)
+    if report["archive"]["torn"]:
+        sys.stderr.write(
+            f"echolume: {archive}: its end is missing or damaged; the map is made of what is before that\n"
+        )
     sys.stdout.write(json.dumps(report, indent=1) + "\n" if args.json else "\n" + table(report))
     if not args.json:
         sys.stdout.write(f"\nResults are in {out}: {', '.join(results['files'])}, report.json\n")

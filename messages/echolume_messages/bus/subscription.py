@@ -33,7 +33,10 @@ def read_sample(sample: zenoh.Sample, topic: Topic) -> Message:
         raise PayloadError(f"{topic.name}: a header of stream {header.stream!r}")
     if len(sample.payload) > topic.limit_bytes + 8192:
         raise PayloadError(f"{topic.name}: payload of {len(sample.payload)} bytes, limit {topic.limit_bytes}")
-    return Message(header, topic, decode(sample.payload.to_bytes(), topic))
+    message = Message(header, topic, decode(sample.payload.to_bytes(), topic))
+    if topic.is_json and not isinstance(message.json(), dict):
+        raise PayloadError(f"{topic.name}: expected a JSON object")
+    return message
 
 
 class Subscription:

@@ -72,6 +72,7 @@ class HybridSubscriber:
         self._held: dict[str, list[Message]] = {}
         self._held_ledgers: dict[str, Json] = {}
         self._counts = {"records": 0, "maps": 0, "dropped": 0}
+        self._error = ""
 
     def step(self, timeout_s: float) -> None:
         """Wait for at most `timeout_s` for a record, and work on it."""
@@ -90,7 +91,7 @@ class HybridSubscriber:
     def health(self) -> dict[str, object]:
         """Counts, scans in work, and the state of the subscription."""
         running = [name for name, scan in self._scans.items() if scan is not None]
-        return {**self._counts, "running": running, "subscription": self._records.stats}
+        return {**self._counts, "error": self._error, "running": running, "subscription": self._records.stats}
 
     def close(self) -> None:
         """Stop receiving."""
@@ -173,10 +174,11 @@ class HybridSubscriber:
         try:
             found, results = conclude(scan.evidence, self._out)
         except OSError as error:
-            log.error(
-                "scan %s: its map cannot be written to %s: %s; `echolume reprocess` makes it from the archive",
-                name, self._out, error.strerror,
-            )  # fmt: skip
+            self._error = (
+                f"scan {name}: its map cannot be written to {self._out}: {error.strerror}; "
+                "`echolume reprocess` makes it from the archive"
+            )
+            log.error("%s", self._error)
             return
         self._counts["maps"] += 1
         log.info("scan %s: map of %d cells, digest %s", name, found.cells.size, results["digest"])

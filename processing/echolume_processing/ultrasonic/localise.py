@@ -6,6 +6,8 @@ the target adds is found in their powers; it is then projected back onto a grid 
 
 from __future__ import annotations
 
+import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -60,22 +62,26 @@ def load_recordings(path: Path) -> Recordings:
     try:
         with np.load(path, allow_pickle=False) as data:
             frames, backgrounds, target = (np.asarray(data[k]) for k in ("frames", "background", "target_mm"))
-    except (OSError, ValueError, KeyError) as error:
-        raise ConfigError(f"{path}: expected an .npz with frames, background and target_mm: {error}") from error
+    except KeyError as error:
+        raise ConfigError(f"{path}: expected frames, background and target_mm in it: {error.args[0]}") from error
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot read the recordings: {error.strerror or error}") from error
+    except (ValueError, TypeError, AttributeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise ConfigError(f"{path}: not an .npz of plain arrays, or a damaged one") from error
     if (
         frames.ndim != 3
         or frames.shape[1] != 4
         or backgrounds.shape != frames.shape
-        or target.shape
-        != (
-            len(frames),
-            3,
-        )
+        or target.shape != (len(frames), 3)
+        or len(frames) < 2
+        or frames.shape[2] <= BLIND_SAMPLES + 2
     ):
         raise ConfigError(
-            f"{path}: expected frames and background (n, 4, samples) and target_mm (n, 3), got {frames.shape}, "
-            f"{backgrounds.shape} and {target.shape}"
+            f"{path}: expected frames and background (n, 4, samples) and target_mm (n, 3) of 2 recordings or more, "
+            f"got {frames.shape}, {backgrounds.shape} and {target.shape}"
         )
+    if not all(a.dtype.kind in "iuf" and bool(np.isfinite(a).all()) for a in (frames, backgrounds, target)):
+        raise ConfigError(f"{path}: expected finite numbers in frames, background and target_mm")
     elements = np.array([[0, 0, 0], [-37.5, -64.95, 0], [75, 0, 0], [-37.5, 64.95, 0]], dtype=np.float64)
     kept = slice(0, frames.shape[2] - 2)  # the last two columns are padding
     return Recordings(

@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from importlib.metadata import EntryPoint, entry_points, version
 
 GROUP = "echolume.commands"
+CLOSED_PIPE = 141
+"""Exit code, as of a program that SIGPIPE ended."""
 
 SUMMARIES = {
     "demo": "scan the emulated rig into a hybrid map, from nothing",
@@ -57,6 +59,26 @@ def overview(found: dict[str, EntryPoint]) -> str:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the program; returns the exit code."""
+    try:
+        try:
+            return _main(argv)
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:  # whoever read has seen enough, as in `| head -1`
+        _give_up_stdout()
+        return CLOSED_PIPE
+    except OSError as error:
+        # The system's refusal of a file is no fault of the program; one that names no file may be.
+        if error.filename is None and error.errno != errno.ENOSPC:
+            raise
+        if error.filename is None:
+            _give_up_stdout()
+        where = "the output" if error.filename is None else str(error.filename)
+        sys.stderr.write(f"echolume: {where}: {error.strerror}\n")
+        return 1
+
+
+def _main(argv: Sequence[str] | None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     if arguments and arguments[0] == "--version":
         sys.stdout.write(f"echolume {version('echolume')}\n")
@@ -101,31 +123,12 @@ def _run(entry: EntryPoint, name: str, rest: list[str]) -> int:
         return 2
     logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s")
     try:
-        return _flushed(int(module.run(args)))
+        return int(module.run(args))
     except EcholumeError as error:
         sys.stderr.write(f"echolume: {error}\n")
         return error.exit_code
     except KeyboardInterrupt:
         return _interrupted()
-    except BrokenPipeError:
-        _give_up_stdout()
-        return 141
-    except OSError as error:
-        # The system's refusal of a file is no fault of the program; one that names no file may be.
-        if error.filename is None and error.errno != errno.ENOSPC:
-            raise
-        where = f"{error.filename}: " if error.filename is not None else ""
-        sys.stderr.write(f"echolume: {where}{error.strerror}\n")
-        return 1
-
-
-def _flushed(code: int) -> int:
-    """The exit code, once the output is out; a reader that has seen enough (``| head -1``) changes nothing."""
-    try:
-        sys.stdout.flush()
-    except BrokenPipeError:
-        _give_up_stdout()
-    return code
 
 
 def _give_up_stdout() -> None:

@@ -45,8 +45,10 @@ def run(args: argparse.Namespace) -> int:
     from echolume_drivers.emulated.rig import EmulatedRig
     from echolume_messages.files import make_folder
 
-    out: Path = make_folder(args.out)
-    with EmulatedRig(args.seed, args.scene, args.speed, args.pulse, out, bare=args.bare) as rig:
+    out: Path = args.out
+    emulated = EmulatedRig(args.seed, args.scene, args.speed, args.pulse, out, bare=args.bare)
+    make_folder(out)
+    with emulated as rig:
         sys.stdout.write(
             f"emulated rig {rig.rig.name} is ready: {rig.rig_file}\n"
             f"  use it:   echolume serve router --rig {rig.rig_file}   (likewise guide, cameras, robot, array, ...)\n"

@@ -20,6 +20,7 @@ from echolume.report import Report, write
 from echolume.results import scan_report, score_maps
 from echolume_daemon.client import ScanClient
 from echolume_drivers.emulated.control import Control
+from echolume_drivers.emulated.rig import FASTEST
 from echolume_drivers.emulated.scene import SCENES
 from echolume_messages import calibration as calibration_file
 from echolume_messages import plan as plans
@@ -105,8 +106,10 @@ def _check(settings: DemoSettings, plan: Plan) -> None:
     """Refuse at once what would fail after the calibration only."""
     if settings.scene not in SCENES:
         raise ConfigError(f"--scene {settings.scene}: unknown; known: {', '.join(SCENES)}")
-    if not settings.speed > 0:
-        raise ConfigError(f"--speed {settings.speed:g}: must be above 0")
+    if not 0 < settings.speed <= FASTEST:
+        raise ConfigError(f"--speed {settings.speed:g}: must be above 0 and at most {FASTEST:g}")
+    if settings.seed < 0:
+        raise ConfigError(f"--seed {settings.seed}: must not be below 0")
     kinds = {step.kind for step in plans.expand(plan)}
     if not {"optical", "ultrasonic"} <= kinds:
         raise ConfigError(

@@ -1,6 +1,6 @@
 """Run a scan plan on the rig and wait for its ledger.
 
-Prompts of the plan are shown; Enter goes on. Ctrl-C aborts in good order.
+Prompts of the plan are shown; Enter goes on. Ctrl-C, SIGTERM and a closed terminal abort in good order.
 Exit code 0 if every trigger is matched, 8 if some are missing or the scan was aborted.
 
 example:
@@ -14,9 +14,10 @@ import json
 import signal
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
-from typing import cast
+from typing import TypeAlias, cast
 
 import msgspec
 
@@ -29,6 +30,9 @@ from echolume_messages.files import make_folder, read_text
 from echolume_messages.rig import Rig
 from echolume_messages.rig_option import add_rig, load_rig
 
+Handlers: TypeAlias = Callable[[int, FrameType | None], object] | int | None
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Ctrl-C, a polite end, and a terminal that is closed: none of them leaves a scan behind that nobody follows."""
 COLUMNS = ("planned", "fired", "matched", "missing", "duplicate", "extra")
 
 
@@ -51,13 +55,13 @@ def run(args: argparse.Namespace) -> int:
     with join_bus(rig) as bus:
         archive = _archive(args.out)
         client = ScanClient(bus, args.holder)
-        before = signal.signal(signal.SIGINT, lambda _n, _f: stop.set())
+        before = {number: signal.signal(number, lambda _n, _f: stop.set()) for number in ENDING}
         try:
             scan = client.start(plan_text, archive=archive, calibration=calibration)
             sys.stderr.write(f"scan {scan}\n")
             ledger = client.wait(Progress().show, lambda text: _ask(text, stop), stop)
         finally:
-            signal.signal(signal.SIGINT, before)
+            _restore(before)
     sys.stdout.write(json.dumps(ledger, indent=1) + "\n" if args.json else table(ledger))
     if ledger["outcome"] == "complete":
         return 0
@@ -85,7 +89,7 @@ def _ask(text: str, stop: threading.Event) -> None:
     def interrupt(_number: int, _frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGINT, interrupt)
+    before = {number: signal.signal(number, interrupt) for number in ENDING}
     try:
         if not sys.stdin.readline():
             sys.stderr.write("nobody is there to answer (end of input): the scan is aborted\n")
@@ -93,7 +97,12 @@ def _ask(text: str, stop: threading.Event) -> None:
     except KeyboardInterrupt:
         stop.set()
     finally:
-        signal.signal(signal.SIGINT, before)
+        _restore(before)
+
+
+def _restore(handlers: dict[signal.Signals, Handlers]) -> None:
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
 
 
 class Progress:

@@ -39,6 +39,8 @@ from echolume_messages.rig import (
 )
 
 Pulse = Literal["wideband", "paper"]
+FASTEST = 1e6
+"""Beyond this a speed is rather a slip of the pen."""
 
 
 class Peer(Protocol):
@@ -87,8 +89,10 @@ class EmulatedRig:
     ) -> None:
         if scene_name not in SCENES:
             raise ConfigError(f"emulated rig: unknown scene {scene_name!r}; known: {', '.join(SCENES)}")
-        if not speed > 0:
-            raise ConfigError(f"emulated rig: speed must be above 0, got {speed}")
+        if not 0 < speed <= FASTEST:
+            raise ConfigError(f"emulated rig: speed must be above 0 and at most {FASTEST:g}, got {speed}")
+        if seed < 0:
+            raise ConfigError(f"emulated rig: seed must not be below 0, got {seed}")
         self._directory = directory.resolve()
         self._stage = Stage(seed, SCENES[scene_name](), speed)
         self._seed = seed

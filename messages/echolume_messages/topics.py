@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -136,6 +137,14 @@ def key_all(rig: str, tree: str, topic: Topic) -> str:
     """Key expression that matches every record of the topic."""
     base = f"echolume/v1/{rig}/{tree}/{topic.name}"
     return f"{base}/*" if topic.triggered else base
+
+
+def keys_decimated(rig: str, tree: str, topic: Topic) -> list[str]:
+    """Key expressions that match every `live_decimation`-th trigger of the topic, and few others."""
+    if not topic.triggered:
+        return [key_all(rig, tree, topic)]
+    every = math.gcd(topic.live_decimation, SHARDS)
+    return [key(rig, tree, topic, shard) for shard in range(0, SHARDS, every)]
 
 
 def command_key(rig: str, service: str, command: str) -> str:

@@ -14,6 +14,7 @@ from echolume_messages.errors import CalibrationMissingError
 from echolume_messages.plan import Plan
 from echolume_messages.types import OPTICAL_POINT, ULTRASONIC_POINT, OpticalSource, Structured
 from echolume_processing.ping import Ping
+from echolume_processing.review import Review
 
 
 class ScanStart(msgspec.Struct):
@@ -23,6 +24,8 @@ class ScanStart(msgspec.Struct):
     plan: Plan
     calibration: Calibration | None = None
     rig: str = ""
+    utc_offset_ns: int = 0
+    """Of the record itself: wall clock minus monotonic clock."""
 
 
 def read_start(message: Message) -> ScanStart:
@@ -34,16 +37,21 @@ def read_start(message: Message) -> ScanStart:
         If it holds a calibration that cannot be read, or a plan that is none.
     """
     try:
-        return msgspec.json.decode(message.payload.tobytes(), type=ScanStart)
+        start = msgspec.json.decode(message.payload.tobytes(), type=ScanStart)
     except msgspec.DecodeError as error:
         raise CalibrationMissingError(
             f"conductor/start of scan {message.header.scan!r}: {error}; it was made by another version"
         ) from error
+    start.utc_offset_ns = message.header.t_wall_ns - message.header.t_ns
+    return start
 
 
 @dataclass
 class Evidence:
-    """Points and pings by trigger; of a trigger acquired twice the later attempt counts."""
+    """Points and pings by trigger; of a trigger acquired twice the later attempt counts.
+
+    The map rests on these alone; `review` is for whoever looks at the recording.
+    """
 
     scan: str
     plan: Plan
@@ -51,6 +59,17 @@ class Evidence:
     optical: dict[int, tuple[int, Structured]] = field(default_factory=dict[int, tuple[int, Structured]])
     pings: dict[int, tuple[int, Ping]] = field(default_factory=dict[int, tuple[int, Ping]])
     ultrasonic: dict[int, tuple[int, Structured]] = field(default_factory=dict[int, tuple[int, Structured]])
+    review: Review = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.review = Review.of(self.plan, self.calibration)
+
+    @classmethod
+    def of(cls, start: ScanStart, calibration: Calibration) -> Evidence:
+        """Evidence of a scan that has begun, without any yet."""
+        found = cls(start.scan, start.plan, calibration)
+        found.review.utc_offset_ns = start.utc_offset_ns
+        return found
 
     def add_optical(self, trigger: int, attempt: int, points: Structured) -> None:
         """Points of one stripe."""

@@ -23,6 +23,7 @@ from echolume_processing.hybrid.fuse import fuse
 from echolume_processing.hybrid.model import HybridMap
 from echolume_processing.optical.pipeline import OpticalPipeline
 from echolume_processing.ping import ping_from_record
+from echolume_processing.review import REPORTS
 from echolume_processing.ultrasonic.pipeline import UltrasonicPipeline
 
 log = logging.getLogger("echolume.session")
@@ -78,20 +79,22 @@ def gather(archive: Path, progress: Progress = silent, start: ScanStart | None =
             f"{archive}: scan {start.scan} was made without a calibration, so there is no map of it; calibrate the rig "
             "(`echolume calibrate rig`), name the file in the rig file, and scan again"
         )
-    evidence = Evidence(start.scan, start.plan, start.calibration)
+    evidence = Evidence.of(start, start.calibration)
     try:
         optical, ultrasonic = OpticalPipeline(start.calibration), UltrasonicPipeline(start.calibration)
     except ValueError as error:
         raise CalibrationError(f"{archive}: the calibration of scan {start.scan} is unusable: {error}") from error
     kinds = {p.name: str(p.__struct_config__.tag) for p in start.plan.passes}
     halves: dict[tuple[int, int], Message] = {}
-    wanted = (topics.CAMERA_LEFT, topics.CAMERA_RIGHT, topics.ECHOES)
+    wanted = (topics.CAMERA_LEFT, topics.CAMERA_RIGHT, topics.ECHOES, *REPORTS)
     for message in archives.read(archive, [t.name for t in wanted]):
         header = message.header
         if header.scan != start.scan:
             continue
         key = (header.trigger, header.attempt)
-        if message.topic == topics.ECHOES and kinds.get(header.pass_name) == "ultrasonic":
+        if message.topic in REPORTS:
+            evidence.review.add_report(message)
+        elif message.topic == topics.ECHOES and kinds.get(header.pass_name) == "ultrasonic":
             try:
                 ping = ping_from_record(header, np.asarray(message.payload, dtype=np.int16))
                 points = ultrasonic.process(ping)
@@ -100,8 +103,10 @@ def gather(archive: Path, progress: Progress = silent, start: ScanStart | None =
                 continue
             evidence.add_ping(*key, ping)
             evidence.add_ultrasonic(*key, points)
+            evidence.review.add_moment(header)
             progress("pings", len(evidence.pings), 0)
         elif message.topic != topics.ECHOES and kinds.get(header.pass_name) == "optical":
+            evidence.review.add_frame(message)
             other = halves.pop(key, None)
             if other is None or other.topic == message.topic:
                 halves[key] = message
@@ -113,6 +118,7 @@ def gather(archive: Path, progress: Progress = silent, start: ScanStart | None =
             except ValueError as error:
                 log.warning("%s: trigger %d: the stripe is skipped: %s", archive, header.trigger, error)
                 continue
+            evidence.review.add_moment(left.header)
             progress("stripes", len(evidence.optical), 0)
     return evidence
 

@@ -49,7 +49,12 @@ class Bus:
             return found
 
     def subscribe(
-        self, wanted: Sequence[Topic], depth: int = 64, refill: bool = True, archive: bool = True
+        self,
+        wanted: Sequence[Topic],
+        depth: int = 64,
+        refill: bool = True,
+        archive: bool = True,
+        decimated: bool = False,
     ) -> Subscription:
         """Receive some topics.
 
@@ -63,8 +68,12 @@ class Bus:
             Records missed are asked for from the journals, and each stream comes in order; else the newest win.
         archive
             Ask the recorder too for what is no longer in the publisher's journal.
+        decimated
+            For looking on: only every `live_decimation`-th trigger of a topic crosses the wire. Nothing is refilled.
         """
-        subscription = Subscription(self._session, self.rig, wanted, depth, refill, archive)
+        subscription = Subscription(
+            self._session, self.rig, wanted, depth, refill and not decimated, archive, decimated
+        )
         self._subscriptions = [s for s in self._subscriptions if not s.closed] + [subscription]
         return subscription
 

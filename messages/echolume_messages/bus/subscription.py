@@ -47,7 +47,14 @@ class Subscription:
     """
 
     def __init__(
-        self, session: zenoh.Session, rig: str, wanted: Sequence[Topic], depth: int, refill: bool, archive: bool
+        self,
+        session: zenoh.Session,
+        rig: str,
+        wanted: Sequence[Topic],
+        depth: int,
+        refill: bool,
+        archive: bool,
+        decimated: bool = False,
     ) -> None:
         self._session = session
         self._rig = rig
@@ -64,7 +71,9 @@ class Subscription:
         self._subscribers: list[zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]] = []
         self._threads: list[threading.Thread] = []
         for topic in wanted:
-            self._listen(topics.key_all(rig, "data", topic), topic)
+            keys = topics.keys_decimated(rig, "data", topic) if decimated else [topics.key_all(rig, "data", topic)]
+            for key in keys:
+                self._listen(key, topic)
             if refill:
                 self._listen(journal_key(rig, "meta", topic), topic)
         if refill:

@@ -1,74 +1,80 @@
-"""The scan as a rerun recording, for review; the only module that touches rerun."""
+"""The scan as a rerun recording, for review; `recording_measured` and `recording_layout` are its other two parts."""
 
 from __future__ import annotations
 
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import rerun as rr
-import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from echolume_messages.types import Label, OpticalSource
+from echolume_messages.types import Label
 from echolume_processing.evidence import Evidence
+from echolume_processing.hybrid import recording_layout, recording_measured
 from echolume_processing.hybrid.digest import digest
 from echolume_processing.hybrid.model import HybridMap, cell_centres_mm
 from echolume_processing.hybrid.ply import LABEL_RGB
 
 APPLICATION = "echolume"
 LABELS = tuple(Label)
-_SETS = {
-    OpticalSource.STEREO: ("rig/map/st", (235, 200, 120)),
-    OpticalSource.ACTIVE_LEFT: ("rig/map/at_left", (120, 200, 140)),
-    OpticalSource.ACTIVE_RIGHT: ("rig/map/at_right", (200, 140, 190)),
-}
+
+_GUIDE = """
+## What is where
+
+| entity | what |
+|---|---|
+| `rig/map/hybrid` | the map, coloured by label; each cell carries its sigma, provenance and counts |
+| `rig/map/st`, `at_left`, `at_right` | points of each stripe: stereo (yellow), active left (green), active right (pink) |
+| `rig/map/us`, `us_normals` | contact points of each ping; blue: the echoes fit a plane, orange: a point |
+| `rig/cam_left`, `rig/cam_right` | cameras; raw frames of a few triggers, with the stripe's peaks that were believed |
+| `rig/laser_plane` | the laser's plane at each stripe |
+| `rig/us_array` | the array at each ping; bright: receivers that the contact points rest on |
+| `us/echoes`, `us/envelope` | raw counts; compressed echoes over the path, 1 is the reference plate |
+| `us/level`, `us/path` | each receiver's level, and the path of its first echo |
+
+Frames are as taken, with the lens' distortion; points and cameras in three dimensions are without.
+"""
 
 
 def write(evidence: Evidence, found: HybridMap, path: Path) -> None:
-    """Write one recording: points as they were acquired, the array's path, the hybrid map and its notes.
+    """Write one recording: what was measured at each trigger, where, and the hybrid map that was made of it.
 
     Notes
     -----
-    The timeline ``scan_step`` is the trigger's number; the map is static. The sink is a file only: a live viewer in
-    the same process could block it.
+    Timelines are the trigger's number (``scan_step``), the rig's monotonic clock (``rig_time``) and ``utc``; map and
+    notes are static. The sink is a file only: a live viewer in the same process could block it.
     """
     recording = rr.RecordingStream(APPLICATION, recording_id=f"{evidence.scan or 'scan'}-{digest(found)}")
-    recording.set_sinks(rr.FileSink(path), default_blueprint=_blueprint())
+    recording.set_sinks(rr.FileSink(path), default_blueprint=recording_layout.blueprint())
+    recording.send_recording_name(f"{evidence.scan} ({evidence.plan.name})")
+    _log_properties(recording, evidence, found)
     recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    _log_stripes(recording, evidence)
-    _log_pings(recording, evidence)
+    recording_measured.log(recording, evidence)
     _log_map(recording, found)
     _log_notes(recording, evidence, found)
     recording.flush(timeout_sec=30.0)
     recording.disconnect()
 
 
-def _log_stripes(recording: rr.RecordingStream, evidence: Evidence) -> None:
-    """The three optical point sets, one step a stripe."""
-    for trigger in sorted(evidence.optical):
-        points = evidence.optical[trigger][1]
-        recording.set_time("scan_step", sequence=trigger)
-        for source, (entity, colour) in _SETS.items():
-            own = points[points["source"] == source]
-            xyz = np.column_stack((own["x_mm"], own["y_mm"], own["z_mm"]))
-            recording.log(entity, rr.Points3D(xyz, colors=[colour], radii=[0.25]))
-
-
-def _log_pings(recording: rr.RecordingStream, evidence: Evidence) -> None:
-    """Contact points with their normals, and the raw echoes' level, one step a ping."""
-    for trigger in sorted(evidence.ultrasonic):
-        points = evidence.ultrasonic[trigger][1]
-        xyz = np.column_stack((points["x_mm"], points["y_mm"], points["z_mm"]))
-        normal = np.column_stack((points["nx"], points["ny"], points["nz"]))
-        recording.set_time("scan_step", sequence=trigger)
-        recording.log("rig/map/us", rr.Points3D(xyz, colors=[(90, 160, 235)], radii=[0.8]))
-        recording.log("rig/map/us_normals", rr.Arrows3D(vectors=8.0 * normal, origins=xyz, colors=[(90, 160, 235)]))
-    for trigger in sorted(evidence.pings):
-        ping = evidence.pings[trigger][1]
-        recording.set_time("scan_step", sequence=trigger)
-        recording.log("us/echoes", rr.Tensor(ping.echoes, dim_names=("receiver", "sample")))
-        recording.log("us/level", rr.Scalars(ping.echoes.astype(np.float64).std(axis=1)))
+def _log_properties(recording: rr.RecordingStream, evidence: Evidence, found: HybridMap) -> None:
+    """What determines the map, as properties of the recording."""
+    ledger = evidence.review.ledger
+    recording.send_property(
+        "scan",
+        rr.AnyValues(
+            scan=evidence.scan,
+            plan=evidence.plan.name,
+            rig=evidence.calibration.rig,
+            archive=Path(ledger.archive).name if ledger else "",
+            outcome=ledger.outcome if ledger else "",
+            calibration_digest=evidence.calibration.digest,
+            map_digest=digest(found),
+            speed_of_sound_mps=found.registration.speed_of_sound_mps,
+            echolume_version=version("echolume"),
+        ),
+    )
 
 
 def _log_map(recording: rr.RecordingStream, found: HybridMap) -> None:
@@ -104,33 +110,18 @@ def _upright(image: NDArray[Any]) -> NDArray[Any]:
 
 def _log_notes(recording: rr.RecordingStream, evidence: Evidence, found: HybridMap) -> None:
     """What a reviewer must know, as a text beside the map."""
-    registration = found.registration
+    registration, ledger = found.registration, evidence.review.ledger
+    passes = ledger.passes if ledger else {}
     lines = [
         f"# Scan {evidence.scan}",
-        f"- plan: {evidence.plan.name}",
-        f"- calibration: {evidence.calibration.digest}",
+        f"- plan {evidence.plan.name}, calibration {evidence.calibration.digest}, echolume {version('echolume')}",
+        f"- archive {Path(ledger.archive).name}, {ledger.outcome}" if ledger else "- no ledger: the archive is torn",
         f"- hybrid map: digest {digest(found)}, {found.cells.size} cells of {found.field.cell_mm} mm",
         f"- self-registration: {registration.dz_mm:+.3f} mm over {registration.pings} pings, "
         f"residual {registration.residual_db:.1f} dB, speed of sound {registration.speed_of_sound_mps:.2f} m/s",
         *(f"- {note}" for note in found.notes),
+        "\n| pass | planned | fired | matched | missing |\n|---|---|---|---|---|" if passes else "",
+        *(f"| {name} | {p.planned} | {p.fired} | {p.matched} | {p.missing} |" for name, p in passes.items()),
+        _GUIDE,
     ]
     recording.log("notes", rr.TextDocument("\n".join(lines), media_type=rr.MediaType.MARKDOWN), static=True)
-
-
-def _blueprint() -> rrb.Blueprint:
-    """The map in three dimensions, its labels and notes beside it, the echoes below."""
-    return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Vertical(
-                rrb.Spatial3DView(origin="/", contents=["rig/map/**"], name="map"),
-                rrb.TimeSeriesView(origin="/us/level", name="echo level"),
-                row_shares=[3, 1],
-            ),
-            rrb.Vertical(
-                rrb.Spatial2DView(origin="/map/labels", name="labels"),
-                rrb.TextDocumentView(origin="/notes", name="notes"),
-            ),
-            column_shares=[2, 1],
-        ),
-        collapse_panels=True,
-    )

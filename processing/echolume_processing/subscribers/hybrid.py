@@ -18,6 +18,7 @@ from echolume_messages.rig import Rig
 from echolume_messages.types import Structured
 from echolume_processing.evidence import Evidence, read_start
 from echolume_processing.ping import ping_from_record
+from echolume_processing.review import REPORTS
 from echolume_processing.session import conclude
 from echolume_processing.subscribers.frame import run_subscriber
 
@@ -27,6 +28,8 @@ STALLED_S = 20.0
 HELD_RECORDS = 2000
 """Records of scans whose start is not known yet."""
 MAX_SCANS = 4
+FRAMES_DEPTH = 8
+"""Frames that may wait to be made pictures; of more, the oldest is not shown."""
 
 log = logging.getLogger("echolume.hybrid")
 Json = dict[str, Any]
@@ -65,12 +68,15 @@ class HybridSubscriber:
         self._out = out
         self._starts = bus.subscribe([topics.SCAN_START], depth=8)
         self._records = bus.subscribe([topics.OPTICAL_POINTS, topics.ECHOES, topics.ULTRASONIC_POINTS], depth=DEPTH)
-        self._ledgers = bus.subscribe([topics.LEDGER], depth=16)
+        self._reports = bus.subscribe(REPORTS, depth=64)
+        self._frames = bus.subscribe(
+            [topics.CAMERA_LEFT, topics.CAMERA_RIGHT], depth=FRAMES_DEPTH, refill=False, decimated=True
+        )
         self._map = bus.publisher(topics.HYBRID_MAP)
         self._done = bus.publisher(topics.HYBRID_DONE)
         self._scans: dict[str, _Scan | None] = {}
         self._held: dict[str, list[Message]] = {}
-        self._held_ledgers: dict[str, Json] = {}
+        self._held_ledgers: dict[str, Message] = {}
         self._counts = {"records": 0, "maps": 0, "dropped": 0}
         self._error = ""
 
@@ -78,12 +84,14 @@ class HybridSubscriber:
         """Wait for at most `timeout_s` for a record, and work on it."""
         while (message := self._starts.get(0.0)) is not None:
             self._begin(message)
-        while (message := self._ledgers.get(0.0)) is not None:
-            self._close_ledger(message)
+        while (message := self._reports.get(0.0)) is not None:
+            self._take_report(message)
         record = self._records.get(timeout_s)
         while record is not None:
             self._take(record)
+            self._keep_frames(1)
             record = self._records.get(0.0)
+        self._keep_frames(FRAMES_DEPTH)
         for name, scan in list(self._scans.items()):
             if scan is not None and scan.ledger is not None:
                 self._finish_if_complete(name, scan)
@@ -91,11 +99,11 @@ class HybridSubscriber:
     def health(self) -> dict[str, object]:
         """Counts, scans in work, and the state of the subscription."""
         running = [name for name, scan in self._scans.items() if scan is not None]
-        return {**self._counts, "error": self._error, "running": running, "subscription": self._records.stats}
+        return {**self._counts, "error": self._error, "running": running, "subscription": self._records.stats, "frames": self._frames.stats}
 
     def close(self) -> None:
         """Stop receiving."""
-        for subscription in (self._starts, self._records, self._ledgers):
+        for subscription in (self._starts, self._records, self._reports, self._frames):
             subscription.close()
 
     def _begin(self, message: Message) -> None:
@@ -106,7 +114,7 @@ class HybridSubscriber:
             found = None
             if start.calibration is not None and start.calibration.rig == self._rig:
                 kinds = {p.name: str(p.__struct_config__.tag) for p in start.plan.passes}
-                found = _Scan(Evidence(start.scan, start.plan, start.calibration), kinds)
+                found = _Scan(Evidence.of(start, start.calibration), kinds)
             elif start.calibration is not None:
                 log.error("scan %s: its calibration is of rig %r; no map", name, start.calibration.rig)
         except EcholumeError as error:
@@ -117,8 +125,26 @@ class HybridSubscriber:
             del self._scans[next(iter(self._scans))]
         for held in self._held.pop(name, []):
             self._take(held)
-        if found is not None and name in self._held_ledgers:
-            found.ledger = self._held_ledgers.pop(name)
+        ledger = self._held_ledgers.pop(name, None)
+        if ledger is not None:
+            self._take_report(ledger)
+
+    def _take_report(self, message: Message) -> None:
+        scan = self._scans.get(message.header.scan)
+        if scan is not None:
+            scan.evidence.review.add_report(message)
+        if message.topic == topics.LEDGER:
+            self._close_ledger(message)
+
+    def _keep_frames(self, most: int) -> None:
+        """Make pictures of at most so many of the frames that came; a frame that was missed is not in the recording."""
+        for _ in range(most):
+            message = self._frames.get(0.0)
+            if message is None:
+                return
+            scan = self._scans.get(message.header.scan)
+            if scan is not None and scan.kinds.get(message.header.pass_name) == "optical":
+                scan.evidence.review.add_frame(message)
 
     def _close_ledger(self, message: Message) -> None:
         ledger = cast("Json", message.json())
@@ -126,7 +152,7 @@ class HybridSubscriber:
             return
         name = message.header.scan
         if name not in self._scans:
-            self._held_ledgers[name] = ledger
+            self._held_ledgers[name] = message
             if len(self._held_ledgers) > MAX_SCANS:
                 del self._held_ledgers[next(iter(self._held_ledgers))]
             return
@@ -159,6 +185,8 @@ class HybridSubscriber:
                 return
         else:
             return
+        if message.topic != topics.ULTRASONIC_POINTS:
+            scan.evidence.review.add_moment(header)
         self._counts["records"] += 1
         scan.last_s = time.monotonic()
         if message.topic != topics.ECHOES:

@@ -8,8 +8,9 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import TypeAlias, cast
+from typing import cast
 
+from echolume_daemon.body import Json
 from echolume_daemon.ledger import Expected, Ledger
 from echolume_messages.bus import Bus
 from echolume_messages.errors import (
@@ -23,8 +24,6 @@ from echolume_messages.errors import (
 from echolume_messages.plan import Step
 from echolume_messages.rig import Rig
 from echolume_messages.topics import CAMERA_LEFT, CAMERA_RIGHT, ECHOES, PASS_STREAMS
-
-Json: TypeAlias = dict[str, object]
 
 SERVICES_OF = {"snap": ("cameras",), "optical": ("guide", "cameras"), "ultrasonic": ("robot", "array")}
 """Services that a pass of a kind needs, besides the recorder."""

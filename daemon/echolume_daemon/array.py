@@ -6,9 +6,9 @@ import threading
 import time
 from typing import Protocol
 
-from echolume_daemon.body import number, pose6, text, whole
+from echolume_daemon.body import Json, number, pose6, text, whole
 from echolume_daemon.device import Slot
-from echolume_daemon.service import Json, Service, run_service
+from echolume_daemon.service import Service, run_service
 from echolume_messages.bus import Bus
 from echolume_messages.header import Source
 from echolume_messages.rig import ArraySettings, Rig

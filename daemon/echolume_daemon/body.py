@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import cast
+from typing import TypeAlias, cast
 
 from echolume_messages.errors import ConfigError
 from echolume_messages.plan import Pose6
 
-Body = Mapping[str, object]
+Body: TypeAlias = Mapping[str, object]
+Json: TypeAlias = dict[str, object]
+"""A command's body, its answer, and every other JSON object on the bus."""
 
 
 def number(body: Body, key: str) -> float:

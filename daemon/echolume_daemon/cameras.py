@@ -7,10 +7,10 @@ import time
 from collections import Counter
 from typing import NamedTuple, Protocol
 
-from echolume_daemon.body import flag, number, text, whole
+from echolume_daemon.body import Json, flag, number, text, whole
 from echolume_daemon.device import Slot
 from echolume_daemon.matching import Armed, FrameMatcher, Verdict
-from echolume_daemon.service import Json, Loop, Service, run_service
+from echolume_daemon.service import Loop, Service, run_service
 from echolume_messages.bus import Bus, Publisher
 from echolume_messages.errors import DeviceAbsentError, DeviceError, DeviceSilentError
 from echolume_messages.header import Source

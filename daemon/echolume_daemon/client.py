@@ -8,13 +8,12 @@ import socket
 import threading
 import time
 from collections.abc import Callable
-from typing import TypeAlias, cast
+from typing import cast
 
+from echolume_daemon.body import Json
 from echolume_messages.bus import Bus, Message
 from echolume_messages.errors import EcholumeError, NoReplyError, WrongStateError
 from echolume_messages.topics import LEDGER, RUN_STATE
-
-Json: TypeAlias = dict[str, object]
 
 START_S = 30.0
 _POLL_S = 1.0

@@ -12,11 +12,11 @@ from typing import cast
 import msgspec
 
 from echolume_daemon.acquisition import SERVICES_OF, Acquisition, Interrupted, make_safe
-from echolume_daemon.body import text
+from echolume_daemon.body import Json, text
 from echolume_daemon.lease import Lease
 from echolume_daemon.ledger import Ledger
 from echolume_daemon.run import ScanRun
-from echolume_daemon.service import Json, Loop, Service, run_service
+from echolume_daemon.service import Loop, Service, run_service
 from echolume_daemon.states import Event, RunState, follow
 from echolume_messages import archive
 from echolume_messages import calibration as calibration_file

@@ -8,9 +8,9 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from typing import Protocol
 
-from echolume_daemon.body import number
+from echolume_daemon.body import Json, number
 from echolume_daemon.device import Slot
-from echolume_daemon.service import Json, Loop, Service, run_service
+from echolume_daemon.service import Loop, Service, run_service
 from echolume_messages.bus import Bus
 from echolume_messages.errors import DeviceAbsentError, DeviceError
 from echolume_messages.rig import GuideSettings, Rig

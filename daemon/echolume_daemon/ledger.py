@@ -10,13 +10,13 @@ from typing import Literal, NamedTuple, TypeAlias
 
 import msgspec
 
+from echolume_daemon.body import Json
 from echolume_messages import archive
 from echolume_messages.errors import ArchiveError
 from echolume_messages.plan import Plan, Step, expand
 from echolume_messages.topics import PASS_STREAMS, SCAN_START
 
 Outcome: TypeAlias = Literal["complete", "incomplete", "aborted", "failed"]
-Json: TypeAlias = dict[str, object]
 
 RAW_STREAMS = frozenset(t.name for topics in PASS_STREAMS.values() for t in topics)
 """Topics whose records belong to triggers."""

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from echolume_daemon.archive_index import ArchiveIndex
-from echolume_daemon.body import text
+from echolume_daemon.body import Json, text
 from echolume_daemon.mcap_writer import ArchiveWriter, Durable
-from echolume_daemon.service import Json, Loop, Service, run_service
+from echolume_daemon.service import Loop, Service, run_service
 from echolume_messages import archive, topics
 from echolume_messages.bus import Bus, Message, Subscription
 from echolume_messages.errors import ArchiveError, ConfigError, WrongStateError

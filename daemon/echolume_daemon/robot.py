@@ -8,9 +8,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from echolume_daemon.body import pose6
+from echolume_daemon.body import Json, pose6
 from echolume_daemon.device import Slot
-from echolume_daemon.service import Json, Service, run_service
+from echolume_daemon.service import Service, run_service
 from echolume_messages.bus import Bus
 from echolume_messages.errors import DeviceAbsentError, DeviceError
 from echolume_messages.rig import Rig, RobotSettings

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 
-from echolume_daemon.service import Json, Service, run_service
+from echolume_daemon.body import Json
+from echolume_daemon.service import Service, run_service
 from echolume_messages.bus import Bus
 from echolume_messages.bus.router import open_router
 from echolume_messages.rig import Rig

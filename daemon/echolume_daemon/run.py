@@ -10,7 +10,8 @@ from typing import Protocol
 
 import msgspec
 
-from echolume_daemon.acquisition import Acquisition, Interrupted, Json, make_safe
+from echolume_daemon.acquisition import Acquisition, Interrupted, make_safe
+from echolume_daemon.body import Json
 from echolume_daemon.ledger import Outcome
 from echolume_daemon.states import Event
 from echolume_messages.bus import Bus, Publisher

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Protocol, TypeAlias
 
+from echolume_daemon.body import Json
 from echolume_daemon.notify import notify, watchdog_period_s
 from echolume_messages.bus import Bus
 from echolume_messages.bus.lifetime import connect_when_up, stopped_by_signals
@@ -19,7 +20,6 @@ from echolume_messages.rig import Rig
 from echolume_messages.rig_option import load_rig
 from echolume_messages.topics import BY_NAME, health
 
-Json: TypeAlias = dict[str, object]
 Handler: TypeAlias = Callable[[Json], Json]
 
 _HEALTH_PERIOD_S = 1.0

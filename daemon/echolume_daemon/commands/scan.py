@@ -21,7 +21,8 @@ from typing import TypeAlias, cast
 
 import msgspec
 
-from echolume_daemon.client import Json, ScanClient
+from echolume_daemon.body import Json
+from echolume_daemon.client import ScanClient
 from echolume_daemon.commands.options import add_holder, join_bus
 from echolume_messages import calibration as calibration_file
 from echolume_messages import plan as plan_file
@@ -59,13 +60,15 @@ def run(args: argparse.Namespace) -> int:
         try:
             scan = client.start(plan_text, archive=archive, calibration=calibration)
             sys.stderr.write(f"scan {scan}\n")
-            ledger = client.wait(Progress().show, lambda text: _ask(text, stop), stop)
+            progress = Progress()
+            ledger = client.wait(progress.show, lambda text: _ask(text, stop), stop)
         finally:
             _restore(before)
     sys.stdout.write(json.dumps(ledger, indent=1) + "\n" if args.json else table(ledger))
     if ledger["outcome"] == "complete":
         return 0
-    raise IncompleteScanError(f"scan {scan}: {ledger['outcome']}; {_missing(ledger)}")
+    why = f": {progress.error}" if progress.error else ""
+    raise IncompleteScanError(f"scan {scan}: {ledger['outcome']}{why}; {_missing(ledger)}")
 
 
 def _archive(out: Path | None) -> str:
@@ -110,9 +113,12 @@ class Progress:
 
     def __init__(self) -> None:
         self._last: tuple[object, object] = ("", "")
+        self.error = ""
+        """What ended the scan, if it failed."""
 
     def show(self, state: Json) -> None:
         """Show a state of the conductor."""
+        self.error = str(state.get("error") or "") or self.error
         line = f"{state['state']:<9} {state['pass'] or '':<12} {state['matched']}/{state['planned']} matched"
         if sys.stderr.isatty():
             sys.stderr.write(f"\r{line:<70}")
@@ -137,5 +143,17 @@ def table(ledger: Json) -> str:
 
 def _missing(ledger: Json) -> str:
     passes = cast("dict[str, Json]", ledger["passes"])
-    named = [f"{name}: {entry['missing_triggers']}" for name, entry in passes.items() if entry["missing_triggers"]]
+    lists = {name: cast("list[int]", entry["missing_triggers"]) for name, entry in passes.items()}
+    named = [f"{name}: {_runs(triggers)}" for name, triggers in lists.items() if triggers]
     return "missing triggers: " + ("; ".join(named) or "none")
+
+
+def _runs(numbers: list[int]) -> str:
+    """``[3, 5-9]`` for 3, 5, 6, 7, 8, 9."""
+    runs: list[list[int]] = []
+    for number in sorted(numbers):
+        if runs and number == runs[-1][1] + 1:
+            runs[-1][1] = number
+        else:
+            runs.append([number, number])
+    return "[" + ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in runs) + "]"

@@ -11,13 +11,12 @@ import json
 import sys
 from typing import cast
 
+from echolume_daemon.body import Json
 from echolume_daemon.commands.options import join
 from echolume_messages.bus import Bus
 from echolume_messages.errors import EcholumeError
 from echolume_messages.rig_option import add_rig
 from echolume_messages.topics import SERVICES
-
-Json = dict[str, object]
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

@@ -116,10 +116,6 @@ class OpticalPipeline:
             frame[:, frame.shape[1] // 2 - 2 : frame.shape[1] // 2 + 2] = 180
         OpticalPipeline.of(cameras[0], cameras[1], laser).process(frames[0], frames[1], 0.0)
 
-    def warm_up(self) -> None:
-        """Compile or load the kernels, so that the first stripe is not late."""
-        self.warm_up_kernels(*self._sizes)
-
     def process(self, left: Frame, right: Frame, x_mm: float) -> Structured:
         """Points of one stripe.
 

@@ -10,10 +10,10 @@ from typing import TextIO
 class Progress:
     """Says what is going on and how far it is."""
 
-    def __init__(self, stream: TextIO = sys.stderr, every_s: float = 5.0) -> None:
-        self._stream = stream
+    def __init__(self, stream: TextIO | None = None, every_s: float = 5.0) -> None:
+        self._stream = sys.stderr if stream is None else stream
         self._every_s = every_s
-        self._live = stream.isatty()
+        self._live = self._stream.isatty()
         self._start_s = time.monotonic()
         self._last_s = 0.0
         self._open = False

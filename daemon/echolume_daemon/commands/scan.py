@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
     if ledger["outcome"] == "complete":
         return 0
     why = f": {progress.error}" if progress.error else ""
-    raise IncompleteScanError(f"scan {scan}: {ledger['outcome']}{why}; {_missing(ledger)}")
+    raise IncompleteScanError(f"scan {scan}: {ledger['outcome']}{why}; {missing(ledger)}")
 
 
 def _archive(out: Path | None) -> str:
@@ -141,7 +141,8 @@ def table(ledger: Json) -> str:
     return "\n".join(rows) + "\n"
 
 
-def _missing(ledger: Json) -> str:
+def missing(ledger: Json) -> str:
+    """The missing triggers of each pass, as text."""
     passes = cast("dict[str, Json]", ledger["passes"])
     lists = {name: cast("list[int]", entry["missing_triggers"]) for name, entry in passes.items()}
     named = [f"{name}: {_runs(triggers)}" for name, triggers in lists.items() if triggers]

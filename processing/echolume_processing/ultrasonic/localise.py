@@ -60,7 +60,8 @@ def load_recordings(path: Path) -> Recordings:
         If the file cannot be read, or an array is missing or of another shape.
     """
     try:
-        with np.load(path, allow_pickle=False) as data:
+        # Opened here: of a damaged file np.load would leave its own handle open.
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
             frames, backgrounds, target = (np.asarray(data[k]) for k in ("frames", "background", "target_mm"))
     except KeyError as error:
         raise ConfigError(f"{path}: expected frames, background and target_mm in it: {error.args[0]}") from error

@@ -130,6 +130,19 @@ def test_only_optical_passes_of_calibrated_scans_with_a_guide_position_are_proce
     assert list(collect(stage, "good", act, 1)) == [23]
 
 
+def test_a_pair_of_another_size_than_calibrated_is_skipped(stage: Bus) -> None:
+    def act() -> None:
+        start_scan(stage, "sizes", calibration("test"))
+        for topic in (topics.CAMERA_LEFT, topics.CAMERA_RIGHT):
+            source = Source(x_mm=0.0, laser_on=True, frame_id=31)
+            stage.publisher(topic).put(
+                np.zeros((8, 8), dtype=np.uint8), scan="sizes", pass_name="light", trigger=31, source=source
+            )
+        put_pair(stage, "sizes", 32, 0.0)
+
+    assert list(collect(stage, "sizes", act, 1)) == [32]
+
+
 def start_message(text: bytes) -> Message:
     header = Header(stream="conductor/start", seq=3, t_ns=0, t_wall_ns=0, boot="b")
     return Message(header, topics.SCAN_START, np.frombuffer(text, dtype=np.uint8))

@@ -87,7 +87,12 @@ class OpticalSubscriber:
             return
         began_s = time.perf_counter()
         pixels = np.asarray(left.payload, dtype=np.uint8), np.asarray(right.payload, dtype=np.uint8)
-        points = setup.pipeline.process(pixels[0], pixels[1], header.source.x_mm)
+        try:
+            points = setup.pipeline.process(pixels[0], pixels[1], header.source.x_mm)
+        except ValueError as error:
+            log.error("trigger %d: the stripe is skipped: %s", header.trigger, error)
+            self._counts["skipped"] += 1
+            return
         self._points.put(
             points,
             scan=header.scan,

@@ -14,6 +14,7 @@ from echolume_messages.errors import CalibrationRejectedError
 from echolume_messages.geometry import Matrix, Points3, robot_from_flange, rotation_from_euler, transform
 from echolume_messages.rig import ArraySettings
 from echolume_processing.ping import Ping
+from echolume_processing.ultrasonic.air import speed_of_sound_mps
 from echolume_processing.ultrasonic.block import BlockFit, fit_block
 from echolume_processing.ultrasonic.pipeline import UPSAMPLING, UltrasonicPipeline, waveforms_from_counts
 from echolume_processing.ultrasonic.plate import Levels, PlateFit, fit_plate, plate_paths
@@ -50,10 +51,6 @@ def nominal_flange_from_array(settings: ArraySettings) -> Matrix:
     )
 
 
-def _nominal_speed_mps(temperature_c: float) -> float:
-    return 331.3 * float(np.sqrt(1 + temperature_c / 273.15))
-
-
 def _provisional(
     pings: Sequence[Ping], settings: ArraySettings, nominal: Matrix
 ) -> tuple[ArrayCalibration, Templates, NDArray[np.float64]]:
@@ -64,7 +61,7 @@ def _provisional(
     paths = plate_paths(poses, emitter, receivers)
     chosen = reference_pings(pings, nominal[:3, 2], REFERENCE_MM)
     first = pings[chosen[0]]
-    speed = 1e3 * _nominal_speed_mps(first.air_temperature_c)
+    speed = 1e3 * speed_of_sound_mps(first.air_temperature_c)
     path = float(paths[chosen[0]].mean())
     band = (layout.low_hz, layout.high_hz) if settings.pulse == "wideband" else (36e3, 44e3)
     cut = cut_templates(pings, chosen, band, (path - GATE_MM) / speed, (path + 2.5 * GATE_MM) / speed)

@@ -9,6 +9,7 @@ from echolume_messages.calibration import ArrayCalibration, Calibration
 from echolume_messages.geometry import apply, require_shape, robot_from_flange
 from echolume_messages.types import ULTRASONIC_POINT, EchoBlock, Structured
 from echolume_processing.ping import Ping
+from echolume_processing.ultrasonic.air import carried_mps
 from echolume_processing.ultrasonic.contact import contact
 from echolume_processing.ultrasonic.envelope import (
     ComplexEnvelope,
@@ -34,9 +35,7 @@ UPSAMPLING = 4
 
 def speed_of_sound_mps(calibration: ArrayCalibration, air_temperature_c: float) -> float:
     """Calibrated speed of sound, carried to another air temperature (ideal gas)."""
-    return calibration.speed_of_sound_mps * float(
-        np.sqrt((air_temperature_c + 273.15) / (calibration.temperature_c + 273.15))
-    )
+    return carried_mps(calibration.speed_of_sound_mps, calibration.temperature_c, air_temperature_c)
 
 
 def waveforms_from_counts(echoes: EchoBlock) -> Waveforms:

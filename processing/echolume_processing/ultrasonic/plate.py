@@ -14,6 +14,7 @@ from scipy.optimize import least_squares
 from echolume_messages.errors import CalibrationRejectedError
 from echolume_messages.geometry import Matrix, Points3, robot_from_flange, rotation_from_vector, transform
 from echolume_processing.ultrasonic.acoustics import directivity
+from echolume_processing.ultrasonic.air import ZERO_CELSIUS_K, speed_of_sound_mps
 
 CHANNEL_SIGMA_MM = 0.02
 """What a channel's path scatters by itself."""
@@ -179,8 +180,8 @@ def fit_plate(
     """
     n_receivers = len(receivers_mm)
     temperature_c = float(np.mean(temperatures_c))
-    scale = np.sqrt((temperatures_c + 273.15) / (temperature_c + 273.15))
-    nominal_speed = 331.3 * float(np.sqrt(1 + temperature_c / 273.15))
+    scale = np.sqrt((temperatures_c + ZERO_CELSIUS_K) / (temperature_c + ZERO_CELSIUS_K))
+    nominal_speed = speed_of_sound_mps(temperature_c)
     robot = np.array([robot_from_flange(p) for p in poses])
     known = np.isfinite(times_s)
     whiten = _whitening(n_receivers)

@@ -6,18 +6,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
-from scipy.special import j1
 
 from echolume_messages.calibration import ArrayCalibration
 from echolume_messages.geometry import Points3
+from echolume_processing.ultrasonic.acoustics import directivity
 from echolume_processing.ultrasonic.envelope import Waveforms
 
 OVERSAMPLING = 8
-
-
-def _directivity(sine: NDArray[np.float64], ka: float) -> NDArray[np.float64]:
-    x = np.maximum(ka * sine, 1e-6)
-    return 2 * j1(x) / x
 
 
 class BlockPredictor:
@@ -79,7 +74,7 @@ class BlockPredictor:
         sine_in = np.sqrt(np.maximum(1 - (way @ axis / path) ** 2, 0.0))
         out_way = way * np.array([1.0, 1.0, -1.0])
         sine_out = np.sqrt(np.maximum(1 - (out_way @ axis / path) ** 2, 0.0))
-        level = _directivity(sine_in, ka) * _directivity(sine_out, ka) / path
+        level = directivity(ka * sine_in) * directivity(ka * sine_out) / path
         return level[:, None] * np.exp(-2j * np.pi * self._frequency_hz * (path / speed - start_s)[:, None])
 
     def _facets(
@@ -94,14 +89,14 @@ class BlockPredictor:
         centres = self._centres_mm
         down = centres - emitter
         there = np.linalg.norm(down, axis=1)
-        level_out = _directivity(np.sqrt(np.maximum(1 - (down @ axis / there) ** 2, 0.0)), ka) / there
+        level_out = directivity(ka * np.sqrt(np.maximum(1 - (down @ axis / there) ** 2, 0.0))) / there
         bins = self._length * OVERSAMPLING
         rate = self._rate_hz * OVERSAMPLING
         rows: list[NDArray[np.float64]] = []
         for receiver in receivers:
             up = receiver - centres
             back = np.linalg.norm(up, axis=1)
-            level_in = _directivity(np.sqrt(np.maximum(1 - (up @ axis / back) ** 2, 0.0)), ka) / back
+            level_in = directivity(ka * np.sqrt(np.maximum(1 - (up @ axis / back) ** 2, 0.0))) / back
             obliquity = 0.5 * (np.abs(down[:, 2]) / there + np.abs(up[:, 2]) / back)
             weight = level_out * level_in * obliquity * (self._area_mm2 / (2 * np.pi * speed))
             at = ((there + back) / speed - start_s) * rate

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple, Protocol
 
 import cv2
 import numpy as np
@@ -11,13 +12,70 @@ from numpy.typing import NDArray
 from echolume_messages.errors import ConfigError
 from echolume_messages.geometry import Points3
 from echolume_messages.types import Frame
+from echolume_processing.optical.corner_fit import refine_corners
 
 Points2 = NDArray[np.float64]
 
 MIN_WINDOW_PX = 5
 MAX_WINDOW_PX = 11
 WINDOW_PER_SQUARE = 0.12
-"""Half window of the corner refinement over the square's size in the image; larger windows take in the next edges."""
+"""Half window of the first refinement over the square's size in the image; the fit that follows has its own."""
+
+
+class Corners(NamedTuple):
+    """Corners found in one image.
+
+    Attributes
+    ----------
+    index : (n,) int64
+        Which of the board's corners, ascending.
+    points_px : (n, 2) float64
+    blur_px : float
+        Standard deviation of the blur of the print's edges, median over the corners; nan if none could be fitted.
+    fitted : float
+        Share of the corners whose surroundings look like a corner of the print.
+    """
+
+    index: NDArray[np.int64]
+    points_px: Points2
+    blur_px: float
+    fitted: float
+
+
+class CalibrationBoard(Protocol):
+    """A flat print with corners of known places."""
+
+    @property
+    def square_mm(self) -> float:
+        """Size of a square."""
+        ...
+
+    @property
+    def corners_mm(self) -> Points3:
+        """All corners (n, 3), board frame, z = 0."""
+        ...
+
+    @property
+    def neighbours(self) -> NDArray[np.int64]:
+        """Pairs (m, 2) of corners that are one square apart."""
+        ...
+
+    @property
+    def name(self) -> str:
+        """What a message calls it, such as ``9x6 corners``."""
+        ...
+
+    def find(self, image: Frame) -> Corners | None:
+        """The board's corners in an image, or None if too little of it is to be seen."""
+        ...
+
+
+def grid_neighbours(columns: int, rows: int) -> NDArray[np.int64]:
+    """Pairs (m, 2) of neighbours in a grid numbered row after row."""
+    number = np.arange(columns * rows).reshape(rows, columns)
+    across = np.stack([number[:, :-1].ravel(), number[:, 1:].ravel()], axis=1)
+    down = np.stack([number[:-1].ravel(), number[1:].ravel()], axis=1)
+    return np.concatenate([across, down])
 
 
 @dataclass(frozen=True)
@@ -46,6 +104,20 @@ class Pattern:
         return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
 
     @property
+    def neighbours(self) -> NDArray[np.int64]:
+        """Pairs (m, 2) of corners that are one square apart."""
+        return grid_neighbours(self.columns, self.rows)
+
+    @property
+    def name(self) -> str:
+        """What a message calls it."""
+        return f"{self.columns}x{self.rows} corners"
+
+    def find(self, image: Frame) -> Corners | None:
+        """All corners, or None if the board is not in the image as a whole."""
+        return _find(image, self)
+
+    @property
     def asymmetric(self) -> bool:
         """Whether colours tell which way round the board lies."""
         return (self.columns + self.rows) % 2 == 1
@@ -66,6 +138,11 @@ def find_corners(image: Frame, pattern: Pattern) -> Points2 | None:
     (pattern.rows * pattern.columns, 2) float64
         Corners in pixels in the order of `Pattern.corners_mm`.
     """
+    found = _find(image, pattern)
+    return None if found is None else found.points_px
+
+
+def _find(image: Frame, pattern: Pattern) -> Corners | None:
     found, raw = cv2.findChessboardCorners(
         image, (pattern.columns, pattern.rows), flags=cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
     )
@@ -79,9 +156,16 @@ def find_corners(image: Frame, pattern: Pattern) -> Points2 | None:
     )
     half = int(np.clip(WINDOW_PER_SQUARE * square_px, MIN_WINDOW_PX, MAX_WINDOW_PX))
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-4)
-    fine = cv2.cornerSubPix(image, rough, (half, half), (-1, -1), criteria)
-    points = np.reshape(np.asarray(fine, dtype=np.float64), (pattern.rows, pattern.columns, 2))
-    return in_board_order(image, points, pattern).reshape(-1, 2)
+    near = np.reshape(
+        np.asarray(cv2.cornerSubPix(image, rough, (half, half), (-1, -1), criteria), dtype=np.float64),
+        (pattern.rows, pattern.columns, 2),
+    )
+    along_x, along_y = np.gradient(near, axis=1), np.gradient(near, axis=0)
+    fine, blur_px = refine_corners(image, near.reshape(-1, 2), along_x.reshape(-1, 2), along_y.reshape(-1, 2))
+    points = in_board_order(image, fine.reshape(near.shape), pattern).reshape(-1, 2)
+    fitted = np.isfinite(blur_px)
+    blur = float(np.median(blur_px[fitted])) if fitted.any() else float("nan")
+    return Corners(np.arange(len(points)), points, blur, float(fitted.mean()))
 
 
 def in_board_order(image: Frame, grid: NDArray[np.float64], pattern: Pattern) -> NDArray[np.float64]:

@@ -18,6 +18,7 @@ DIMENSIONLESS = {
     "dip": "share of a lobe's height",
     "max_chi_squared": "per degree of freedom",
     "origin": "sample of a template, may lie between two",
+    "reach": "share of a board's square",
     "speed": "emulated motion: times real time",
     "surface": "share of a plate's amplitude",
     "threshold": "height of an envelope, in its own unit",

@@ -5,36 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from echolume_messages import geometry
 from echolume_messages.calibration import CameraCalibration
 from echolume_messages.geometry import Matrix, Points3, require_shape
+from echolume_processing.optical.lens import undistort_points
 
 Points2 = NDArray[np.float64]
-MAX_ITERATIONS = 40
-
-
-@njit(cache=True, nogil=True)
-def _undistort(points: Points2, matrix: Matrix, distortion: NDArray[np.float64], out: Points2) -> None:
-    k1, k2, p1, p2, k3 = distortion[0], distortion[1], distortion[2], distortion[3], distortion[4]
-    fx, skew, cx, fy, cy = matrix[0, 0], matrix[0, 1], matrix[0, 2], matrix[1, 1], matrix[1, 2]
-    for i in range(points.shape[0]):
-        y0 = (points[i, 1] - cy) / fy
-        x0 = (points[i, 0] - cx - skew * y0) / fx
-        x, y = x0, y0
-        for _ in range(MAX_ITERATIONS):
-            r2 = x * x + y * y
-            radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-            xn = (x0 - 2 * p1 * x * y - p2 * (r2 + 2 * x * x)) / radial
-            yn = (y0 - p1 * (r2 + 2 * y * y) - 2 * p2 * x * y) / radial
-            moved = abs(xn - x) + abs(yn - y)
-            x, y = xn, yn
-            if not moved > 1e-13:
-                break
-        out[i, 0] = fx * x + skew * y + cx
-        out[i, 1] = fy * y + cy
 
 
 @dataclass(frozen=True)
@@ -65,18 +43,29 @@ class Camera:
         """Optical centre in the rig frame, (3,)."""
         return geometry.invert(self.camera_from_rig)[:3, 3]
 
+    @property
+    def lens(self) -> NDArray[np.float64]:
+        """What the kernels need of the lens, (10,): fx, skew, cx, fy, cy, then k1, k2, p1, p2, k3."""
+        m = self.matrix
+        return np.array([m[0, 0], m[0, 1], m[0, 2], m[1, 1], m[1, 2], *self.distortion], dtype=np.float64)
+
+    @property
+    def ray_matrix(self) -> Matrix:
+        """Ray direction in the rig frame, depth 1, of a homogeneous undistorted point, shape (3, 3)."""
+        return self.camera_from_rig[:3, :3].T @ np.linalg.inv(self.matrix)
+
     def undistort(self, points_px: Points2) -> Points2:
         """Undistorted pixel coordinates (n, 2) of image points (n, 2); nan stays nan."""
         require_shape("points_px", points_px, (None, 2))
         out = np.empty(points_px.shape, dtype=np.float64)
-        _undistort(np.ascontiguousarray(points_px, dtype=np.float64), self.matrix, self.distortion, out)
+        undistort_points(np.ascontiguousarray(points_px, dtype=np.float64), self.lens, out)
         return out
 
     def rays(self, points_px: Points2) -> Points3:
         """Directions (n, 3) in the rig frame, depth 1, of undistorted points (n, 2)."""
         require_shape("points_px", points_px, (None, 2))
         homogeneous = np.column_stack([points_px, np.ones(len(points_px))])
-        return homogeneous @ (self.camera_from_rig[:3, :3].T @ np.linalg.inv(self.matrix)).T
+        return homogeneous @ self.ray_matrix.T
 
     def project(self, points_mm: Points3) -> Points2:
         """Distorted image points (n, 2) of rig points (n, 3) in mm."""

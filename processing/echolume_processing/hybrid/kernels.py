@@ -6,8 +6,6 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from echolume_processing.hybrid.surface import AZIMUTHS
-
 ANGLES = 512
 """Entries of the directivity table, over sin^2 of the angle to the axis."""
 WALL_STEP_MM = 2.0
@@ -16,7 +14,8 @@ WALL_STEP_MM = 2.0
 @numba.njit(cache=True, fastmath=True, inline="always")
 def _shadowed(horizon: NDArray[np.float32], dx: float, dy: float, dz: float) -> bool:
     """Whether the horizon of a facet hides what lies in the direction (dx, dy, dz)."""
-    azimuth = int(np.floor(np.arctan2(dy, dx) * (AZIMUTHS / (2 * np.pi)) + 0.5)) % AZIMUTHS
+    azimuths = horizon.size
+    azimuth = int(np.floor(np.arctan2(dy, dx) * (azimuths / (2 * np.pi)) + 0.5)) % azimuths
     tangent = horizon[azimuth]
     return tangent > 0 and dz * dz < tangent * tangent * (dx * dx + dy * dy)
 
@@ -36,7 +35,7 @@ def _lay(
         out[channel, m, k + 1] += value * part
 
 
-@numba.njit(cache=True, fastmath=True)
+@numba.njit(cache=True, fastmath=True, nogil=True)
 def lay_facets(
     out: NDArray[np.float32],
     height_mm: NDArray[np.float64],
@@ -100,7 +99,7 @@ def lay_facets(
                 _lay(out, c - 1, area * (lit1 + lit2) / (r1 * r2), (r1 + r2) * bins_per_mm - first_bin, de, dr)
 
 
-@numba.njit(cache=True, fastmath=True)
+@numba.njit(cache=True, fastmath=True, nogil=True)
 def lay_walls(
     out: NDArray[np.float32],
     walls: NDArray[np.float64],

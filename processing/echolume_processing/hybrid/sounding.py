@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -55,8 +57,13 @@ class Sounding:
         return centre[:, :2] - axis[:, :2] / axis[:, 2:] * centre[:, 2:]
 
     def predict(self, scene: Surface, which: Sequence[int] | NDArray[np.int64]) -> Spectra:
-        """Predicted band spectra in counts of some pings over a surface."""
-        return np.stack([self.channels.predicted(self.predictor.spectra(scene, self.apertures[int(k)])) for k in which])
+        """Predicted band spectra in counts of some pings over a surface, each by itself, side by side on the cores."""
+
+        def one(k: int) -> NDArray[np.complex64]:
+            return self.channels.predicted(self.predictor.spectra(scene, self.apertures[k]))
+
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            return np.stack(list(pool.map(one, [int(k) for k in which])))
 
     def residual(self, predicted: Spectra, which: NDArray[np.int64]) -> NDArray[np.float64]:
         """Energy of measured minus predicted over the measured energy, one number a ping."""

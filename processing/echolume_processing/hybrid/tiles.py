@@ -8,7 +8,6 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from echolume_processing.hybrid.kernels import ANGLES
 from echolume_processing.hybrid.plates import Plane
 from echolume_processing.hybrid.predict import directivity
 from echolume_processing.hybrid.scipy_typed import Mask, closed, interpolated
@@ -217,7 +216,7 @@ def _lobes(
     for c in range(elements_mm.shape[0]):
         vx, vy, vz = elements_mm[c, 0] - x, elements_mm[c, 1] - y, elements_mm[c, 2] - z
         cosine = -(vx * axis[0] + vy * axis[1] + vz * axis[2]) / np.sqrt(vx * vx + vy * vy + vz * vz)
-        lobe = table[int((1 - min(1.0, max(0.0, cosine)) ** 2) * (ANGLES - 1))]
+        lobe = table[int((1 - min(1.0, max(0.0, cosine)) ** 2) * (table.shape[0] - 1))]
         if c == 0:
             emitted = lobe
             continue

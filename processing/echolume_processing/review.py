@@ -82,7 +82,7 @@ class RunState(msgspec.Struct):
 
 @dataclass
 class Review:
-    """Gathered beside the evidence in any order, of bounded size; of a trigger acquired twice the later attempt counts."""
+    """Gathered beside the evidence, in any order and of bounded size; of a trigger's attempts the latest counts."""
 
     calibration: Calibration
     picture_every: int
@@ -109,17 +109,19 @@ class Review:
         if found is None or header.attempt >= found.attempt:
             self.moments[header.trigger] = Moment(header.attempt, header.t_ns, header.source.x_mm)
 
-    def add_frame(self, message: Message) -> None:
-        """Keep a camera's frame if its trigger's turn has come, and it is of the calibrated size."""
+    def add_frame(self, message: Message) -> bool:
+        """Keep a frame if it is its trigger's turn and it is of the calibrated size; whether it was kept."""
         header, side = message.header, SIDES[message.topic.name]
         camera = self.calibration.left if side == "left" else self.calibration.right
         wanted = header.trigger >= 0 and header.trigger % self.picture_every == 0
         if not wanted or message.payload.shape != (camera.height_px, camera.width_px):
-            return
+            return False
         found = self.pictures.get((side, header.trigger))
-        if found is None or header.attempt >= found.attempt:
-            pixels = jpeg(np.asarray(message.payload, dtype=np.uint8))
-            self.pictures[side, header.trigger] = Picture(header.attempt, header.t_ns, pixels)
+        if found is not None and header.attempt < found.attempt:
+            return False
+        pixels = jpeg(np.asarray(message.payload, dtype=np.uint8))
+        self.pictures[side, header.trigger] = Picture(header.attempt, header.t_ns, pixels)
+        return True
 
     def add_report(self, message: Message) -> None:
         """Run state or ledger, a line in the log where something changes."""
@@ -135,7 +137,8 @@ class Review:
         self.ledger = ledger
         counts = ", ".join(f"{name} {p.matched} of {p.planned}" for name, p in ledger.passes.items())
         complete = ledger.outcome == "complete" or not ledger.final
-        self._say(t_ns, "INFO" if complete else "ERROR", f"ledger: {ledger.outcome}; matched: {counts or 'nothing'}")
+        outcome = ledger.outcome if ledger.final else "so far"
+        self._say(t_ns, "INFO" if complete else "ERROR", f"ledger, {outcome}: matched {counts or 'nothing'}")
 
     def _add_state(self, t_ns: int, state: RunState) -> None:
         if state == self._state or (self.ledger is not None and self.ledger.final):

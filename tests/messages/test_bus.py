@@ -159,6 +159,21 @@ def test_a_subscriber_without_refill_gets_the_newest(endpoint: str, rig: str) ->
         assert sub.stats["dropped"] > 0
 
 
+def test_who_only_looks_on_gets_every_fourth_frame(endpoint: str, rig: str) -> None:
+    with (
+        connect(endpoint, rig) as a,
+        connect(endpoint, rig) as b,
+        b.subscribe([topics.CAMERA_LEFT, topics.LEDGER], depth=16, decimated=True) as sub,
+    ):
+        for k in range(18):
+            a.publisher(topics.CAMERA_LEFT).put(np.zeros((4, 6), dtype="u1"), trigger=k)
+        a.publisher(topics.LEDGER).put_json({})
+        until(lambda: sub.stats["received"] == 6, "five frames and a ledger")
+        found = [message for _ in range(6) if (message := sub.get(0.0)) is not None]
+    assert sorted(m.header.trigger for m in found if m.topic == topics.CAMERA_LEFT) == [0, 4, 8, 12, 16]
+    assert sum(m.topic == topics.LEDGER for m in found) == 1
+
+
 def _sees(sub: Subscription, k: int) -> bool:
     return any(m.header.seq == k for m in list(sub._queue))
 

@@ -26,9 +26,9 @@ _GUIDE = """
 | entity | what |
 |---|---|
 | `rig/map/hybrid` | the map, coloured by label; each cell carries its sigma, provenance and counts |
-| `rig/map/st`, `at_left`, `at_right` | points of each stripe: stereo (yellow), active left (green), active right (pink) |
+| `rig/map/st`, `at_left`, `at_right` | points of each stripe: stereo yellow, active left green, active right pink |
 | `rig/map/us`, `us_normals` | contact points of each ping; blue: the echoes fit a plane, orange: a point |
-| `rig/cam_left`, `rig/cam_right` | cameras; raw frames of a few triggers, with the stripe's peaks that were believed |
+| `rig/cam_left`, `rig/cam_right` | cameras; raw frames of a few triggers, and the peaks that were believed |
 | `rig/laser_plane` | the laser's plane at each stripe |
 | `rig/us_array` | the array at each ping; bright: receivers that the contact points rest on |
 | `us/echoes`, `us/envelope` | raw counts; compressed echoes over the path, 1 is the reference plate |

@@ -27,14 +27,13 @@ SETS = {
     OpticalSource.ACTIVE_RIGHT: ("rig/map/at_right", (200, 140, 190)),
 }
 SIDES = {"left": OpticalSource.ACTIVE_LEFT, "right": OpticalSource.ACTIVE_RIGHT}
-KIND_RGB = {EchoKind.PLANE: (90, 160, 235), EchoKind.POINT: (240, 150, 70)}
+KIND_RGB = {int(EchoKind.PLANE): (90, 160, 235), int(EchoKind.POINT): (240, 150, 70)}
 USED_RGB, IDLE_RGB, EMITTER_RGB = (120, 230, 255), (70, 80, 95), (240, 110, 90)
 LASER_RGBA = (255, 60, 60, 70)
 PLANE_MM = (130.0, 90.0)
 """Half width along the line, and height, of the drawn piece of the laser plane."""
-IMAGE_PLANE_MM = 150.0
+IMAGE_PLANE_MM = 300.0
 NORMAL_MM = 8.0
-STANDS = ("x_mm", "y_mm", "z_mm")
 
 
 def log(recording: rr.RecordingStream, evidence: Evidence) -> None:
@@ -84,7 +83,7 @@ class _Clock:
 
 def _xyz(points: Structured) -> NDArray[np.float32]:
     """Positions (n, 3) of points."""
-    return np.column_stack([points[name] for name in STANDS])
+    return np.column_stack((points["x_mm"], points["y_mm"], points["z_mm"]))
 
 
 def _log_camera(recording: rr.RecordingStream, side: str, camera: CameraCalibration) -> None:
@@ -114,9 +113,7 @@ def _moved(rig_from_body: NDArray[np.float64], body: str) -> rr.Transform3D:
     )
 
 
-def _log_pictures(
-    recording: rr.RecordingStream, clock: _Clock, evidence: Evidence, side: str, camera: Camera
-) -> None:
+def _log_pictures(recording: rr.RecordingStream, clock: _Clock, evidence: Evidence, side: str, camera: Camera) -> None:
     """Raw frames of one camera, and on them the peaks that its active points were made of."""
     for trigger in sorted(t for s, t in evidence.review.pictures if s == side):
         picture = evidence.review.pictures[side, trigger]
@@ -168,19 +165,21 @@ def laser_corners_mm(laser: LaserCalibration, guide_x_mm: float) -> NDArray[np.f
 def _log_array(recording: rr.RecordingStream, clock: _Clock, evidence: Evidence) -> None:
     """The array where the robot held it at each ping; the receivers that contact points rest on are bright."""
     array, pipeline = evidence.calibration.array, UltrasonicPipeline(evidence.calibration)
-    for part in ("receivers", "emitter"):
-        recording.log(f"rig/us_array/{part}", rr.CoordinateFrame("us_array"), static=True)
     for first, trigger in enumerate(sorted(evidence.pings)):
         clock.at(trigger)
+        if trigger - 1 in evidence.optical:  # the laser is out while the array listens
+            recording.log("rig/laser_plane", rr.Clear(recursive=False))
         pose = pipeline.rig_from_array(evidence.pings[trigger][1].robot_pose)
         recording.log("tf/us_array", _moved(pose, "us_array"))
-        if first == 0:
-            radii = [0.8 * array.radius_mm]
-            recording.log("rig/us_array/receivers", rr.Points3D(array.receivers_mm, radii=radii))
-            recording.log("rig/us_array/emitter", rr.Points3D([array.emitter_mm], radii=radii, colors=[EMITTER_RGB]))
+        if first == 0:  # not static: before the first ping the array has no place
+            frame, radii = rr.CoordinateFrame("us_array"), [0.8 * array.radius_mm]
+            recording.log("rig/us_array/receivers", frame, rr.Points3D(array.receivers_mm, radii=radii))
+            emitter = rr.Points3D([array.emitter_mm], radii=radii, colors=[EMITTER_RGB])
+            recording.log("rig/us_array/emitter", frame, emitter)
         colours = np.full((len(array.receivers_mm), 3), IDLE_RGB, dtype=np.uint8)
         if trigger in evidence.ultrasonic:
-            colours[evidence.ultrasonic[trigger][1]["receiver"]] = USED_RGB
+            used = evidence.ultrasonic[trigger][1]["receiver"]
+            colours[used[used < len(colours)]] = USED_RGB
         recording.log("rig/us_array/receivers", rr.Points3D.from_fields(colors=colours))
 
 
@@ -189,12 +188,18 @@ def _log_contacts(recording: rr.RecordingStream, clock: _Clock, evidence: Eviden
     for trigger in sorted(evidence.ultrasonic):
         points = evidence.ultrasonic[trigger][1]
         normals = np.column_stack((points["nx"], points["ny"], points["nz"]))
-        colours = [KIND_RGB.get(EchoKind(kind), IDLE_RGB) for kind in points["kind"]]
+        colours = [KIND_RGB.get(int(kind), IDLE_RGB) for kind in points["kind"]]
         clock.at(trigger)
         recording.log(
             "rig/map/us",
             rr.Points3D(_xyz(points), colors=colours, radii=[0.8]),
-            rr.AnyValues(**{name: points[name] for name in ("sigma_mm", "path_mm", "energy", "lobes", "receiver")}),
+            rr.AnyValues(
+                sigma_mm=points["sigma_mm"],
+                path_mm=points["path_mm"],
+                energy=points["energy"],
+                lobes=points["lobes"],
+                receiver=points["receiver"],
+            ),
         )
         recording.log(
             "rig/map/us_normals", rr.Arrows3D(vectors=NORMAL_MM * normals, origins=_xyz(points), colors=colours)
@@ -215,6 +220,7 @@ def _log_echoes(recording: rr.RecordingStream, clock: _Clock, evidence: Evidence
         recording.log("us/level", rr.Scalars(ping.echoes.astype(np.float64).std(axis=1)))
         if trigger in evidence.ultrasonic:
             points = evidence.ultrasonic[trigger][1]
+            points = points[points["receiver"] < channels]
             paths_mm = np.full(channels, np.nan)
             paths_mm[points["receiver"]] = points["path_mm"]
             recording.log("us/path", rr.Scalars(paths_mm))

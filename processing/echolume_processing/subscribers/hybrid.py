@@ -77,13 +77,12 @@ class HybridSubscriber:
         self._scans: dict[str, _Scan | None] = {}
         self._held: dict[str, list[Message]] = {}
         self._held_ledgers: dict[str, Message] = {}
-        self._counts = {"records": 0, "maps": 0, "dropped": 0}
+        self._counts = {"records": 0, "maps": 0, "dropped": 0, "pictures": 0}
         self._error = ""
 
     def step(self, timeout_s: float) -> None:
         """Wait for at most `timeout_s` for a record, and work on it."""
-        while (message := self._starts.get(0.0)) is not None:
-            self._begin(message)
+        self._take_starts()
         while (message := self._reports.get(0.0)) is not None:
             self._take_report(message)
         record = self._records.get(timeout_s)
@@ -99,12 +98,22 @@ class HybridSubscriber:
     def health(self) -> dict[str, object]:
         """Counts, scans in work, and the state of the subscription."""
         running = [name for name, scan in self._scans.items() if scan is not None]
-        return {**self._counts, "error": self._error, "running": running, "subscription": self._records.stats, "frames": self._frames.stats}
+        return {
+            **self._counts,
+            "error": self._error,
+            "running": running,
+            "subscription": self._records.stats,
+            "frames": self._frames.stats,
+        }
 
     def close(self) -> None:
         """Stop receiving."""
         for subscription in (self._starts, self._records, self._reports, self._frames):
             subscription.close()
+
+    def _take_starts(self) -> None:
+        while (message := self._starts.get(0.0)) is not None:
+            self._begin(message)
 
     def _begin(self, message: Message) -> None:
         name = message.header.scan
@@ -142,9 +151,11 @@ class HybridSubscriber:
             message = self._frames.get(0.0)
             if message is None:
                 return
+            if message.header.scan not in self._scans:
+                self._take_starts()
             scan = self._scans.get(message.header.scan)
             if scan is not None and scan.kinds.get(message.header.pass_name) == "optical":
-                scan.evidence.review.add_frame(message)
+                self._counts["pictures"] += scan.evidence.review.add_frame(message)
 
     def _close_ledger(self, message: Message) -> None:
         ledger = cast("Json", message.json())

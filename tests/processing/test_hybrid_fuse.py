@@ -9,9 +9,11 @@ import pytest
 from echolume_drivers.emulated.scene import Material
 from echolume_messages.calibration import Calibration
 from echolume_messages.types import OPTICAL_POINT, Label, Provenance
+from echolume_processing.hybrid import kernels, surface, tiles
 from echolume_processing.hybrid.digest import digest
 from echolume_processing.hybrid.fuse import fuse
 from echolume_processing.hybrid.model import HybridMap
+from echolume_processing.hybrid.warm_up import warm_up
 from processing.hybrid_scan import FIELD, SmallScan, all_matte, glass_and_black, small_scan
 
 RIM = 120 - 48
@@ -100,3 +102,10 @@ def test_a_narrow_band_says_what_it_cannot_decide(scan: SmallScan) -> None:
     narrow: Calibration = msgspec.structs.replace(scan.calibration, array=array)
     found = fuse(scan.optical, scan.pings[::6], narrow, FIELD)
     assert any("narrow band" in note for note in found.notes)
+
+
+def test_the_warm_up_compiles_what_fusing_uses(found: HybridMap) -> None:
+    assert found.cells.size
+    warm_up()
+    for kernel in (kernels.lay_facets, kernels.lay_walls, surface._horizons, tiles._tile_spectra, tiles._solve_box):
+        assert len(kernel.signatures) == 1, f"{kernel.__name__}: fusing and warm-up call it with other types"

@@ -127,6 +127,18 @@ def _roughness(grid: NDArray[np.int64], count: int) -> NDArray[np.float64]:
     return out
 
 
+def warm_up() -> None:
+    """Compile or load the kernels of this module."""
+    flat, slope = np.zeros((TILE_CELLS, TILE_CELLS)), np.zeros((TILE_CELLS, TILE_CELLS, 2), dtype=np.float32)
+    elements_mm, axis = np.array([[0.0, 0.0, 100.0], [15.0, 0.0, 100.0]]), np.array([0.0, 0.0, -1.0])
+    table, weights = np.ones((8, 1), dtype=np.float32), np.ones((1, 2), dtype=np.float32)
+    corners, wave = np.zeros((1, 2), dtype=np.int64), np.array([0.8, 0.9])
+    _tile_spectra(
+        corners, flat, slope, flat, 0.0, 0.0, 0.0, 0.0, 1.0, elements_mm, axis, table, weights, wave
+    )  # fmt: skip
+    _solve_box(np.eye(2), np.ones(2), 1)
+
+
 @numba.njit(cache=True)
 def _solve_box(gram: NDArray[np.float64], right: NDArray[np.float64], sweeps: int) -> NDArray[np.float64]:
     """Minimise x'Gx/2 - b'x over 0 <= x <= 1 by projected Gauss-Seidel."""

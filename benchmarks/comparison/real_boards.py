@@ -35,6 +35,8 @@ def calibration_rows() -> dict[str, float]:
     pair = calibrate_cameras(left, right, PATTERN, SQUARE_MM, names)
     if len(pair.views) != VIEWS:
         raise RuntimeError(f"real boards: {len(pair.views)} of {VIEWS} views used: {pair.rejected}")
+    left_out = pair.left_out
+    print(f"real boards: views left out in turn: {left_out.rms_px:.4f} px, {left_out.rms_mm:.3f} mm RMS")
     return {
         "real_left_px": pair.left_rms_px,
         "real_right_px": pair.right_rms_px,

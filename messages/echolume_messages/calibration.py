@@ -44,6 +44,16 @@ class LaserCalibration(msgspec.Struct, forbid_unknown_fields=True, kw_only=True)
     offset_mm: float
     guide_direction: Vector3
     rms_mm: float
+    plane_covariance: Rows | msgspec.UnsetType = msgspec.UNSET
+    """(4, 4) C in mm^2: at guide position s, y and z the plane's distance along its normal has the variance
+    q C q with q = (1, s, y, z). Absent where nobody has estimated it."""
+
+    def sigma_mm(self, x_mm: float, y_mm: float, z_mm: float) -> float | None:
+        """Standard deviation of the plane's position there, along its normal; None where it is not known."""
+        if isinstance(self.plane_covariance, msgspec.UnsetType):
+            return None
+        q = np.array([1.0, x_mm, y_mm, z_mm])
+        return float(np.sqrt(q @ np.array(self.plane_covariance, dtype=np.float64) @ q))
 
 
 class ArrayCalibration(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):

@@ -84,17 +84,11 @@ def parse_pattern(text: str) -> tuple[int, int]:
 
 def run_cameras(args: argparse.Namespace) -> int:
     """``echolume calibrate cameras``."""
-    from echolume_processing.optical.board import Pattern
-    from echolume_processing.optical.calibrate import calibrate_cameras, leave_one_out_mm
+    from echolume_processing.optical.calibrate import calibrate_cameras
 
     pattern = parse_pattern(args.pattern)
     names, left, right = read_pairs(args.folder)
     pair = calibrate_cameras(left, right, pattern, args.square, names)
-    left_out_mm = (
-        leave_one_out_mm(pair.views, Pattern(*pattern, args.square), pair.image_size_px)
-        if len(pair.views) > 4
-        else None
-    )
     published = published_rms_px(args.folder)
     figures: dict[str, object] = {
         "views": len(pair.views),
@@ -107,7 +101,7 @@ def run_cameras(args: argparse.Namespace) -> int:
         "square_mm": args.square,
         "square_mean_mm": pair.square_mm[0],
         "square_sd_mm": pair.square_mm[1],
-        "leave_one_out_mm": left_out_mm,
+        "leave_one_out_mm": pair.left_out.rms_mm,
     }
     if args.json:
         sys.stdout.write(json.dumps(figures, indent=1) + "\n")
@@ -121,8 +115,8 @@ def run_cameras(args: argparse.Namespace) -> int:
         ("baseline", f"{pair.baseline_mm:.3f} mm"),
         ("squares, triangulated", f"{pair.square_mm[0]:.3f} mm +- {pair.square_mm[1]:.3f} mm (true: {args.square:g})"),
     ]
-    if left_out_mm is not None:
-        rows.append(("views left out in turn", f"corners within {left_out_mm:.3f} mm RMS of the board's shape"))
+    if pair.left_out.names:
+        rows.append(("views left out in turn", f"corners within {pair.left_out.rms_mm:.3f} mm RMS of the board's shape"))
     _write_table(rows, pair.rejected)
     return 0
 

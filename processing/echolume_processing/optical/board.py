@@ -27,7 +27,7 @@ class Corners(NamedTuple):
 
     Attributes
     ----------
-    index : (n,) int64
+    which : (n,) int64
         Which of the board's corners, ascending.
     points_px : (n, 2) float64
     blur_px : float
@@ -36,7 +36,7 @@ class Corners(NamedTuple):
         Share of the corners whose surroundings look like a corner of the print.
     """
 
-    index: NDArray[np.int64]
+    which: NDArray[np.int64]
     points_px: Points2
     blur_px: float
     fitted: float
@@ -70,6 +70,14 @@ class CalibrationBoard(Protocol):
         ...
 
 
+def grid_mm(columns: int, rows: int, square_mm: float) -> Points3:
+    """Places (rows * columns, 3) of a grid of corners; row after row, x fastest, z = 0."""
+    places = np.zeros((rows, columns, 3))
+    places[:, :, 0] = np.arange(columns) * square_mm
+    places[:, :, 1] = np.arange(rows)[:, None] * square_mm
+    return places.reshape(-1, 3)
+
+
 def grid_neighbours(columns: int, rows: int) -> NDArray[np.int64]:
     """Pairs (m, 2) of neighbours in a grid numbered row after row."""
     number = np.arange(columns * rows).reshape(rows, columns)
@@ -100,8 +108,7 @@ class Pattern:
     @property
     def corners_mm(self) -> Points3:
         """Inner corners (rows * columns, 3), board frame; row after row, x fastest."""
-        y, x = np.mgrid[0 : self.rows, 0 : self.columns].astype(np.float64) * self.square_mm
-        return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+        return grid_mm(self.columns, self.rows, self.square_mm)
 
     @property
     def neighbours(self) -> NDArray[np.int64]:
@@ -160,8 +167,8 @@ def _find(image: Frame, pattern: Pattern) -> Corners | None:
         np.asarray(cv2.cornerSubPix(image, rough, (half, half), (-1, -1), criteria), dtype=np.float64),
         (pattern.rows, pattern.columns, 2),
     )
-    along_x, along_y = np.gradient(near, axis=1), np.gradient(near, axis=0)
-    fine, blur_px = refine_corners(image, near.reshape(-1, 2), along_x.reshape(-1, 2), along_y.reshape(-1, 2))
+    along_x, along_y = (np.reshape(np.asarray(np.gradient(near, axis=axis)), (-1, 2)) for axis in (1, 0))
+    fine, blur_px = refine_corners(image, near.reshape(-1, 2), along_x, along_y)
     points = in_board_order(image, fine.reshape(near.shape), pattern).reshape(-1, 2)
     fitted = np.isfinite(blur_px)
     blur = float(np.median(blur_px[fitted])) if fitted.any() else float("nan")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,15 +14,15 @@ from echolume_messages.bus.message import Message
 from echolume_messages.calibration import CameraCalibration, LaserCalibration
 from echolume_messages.errors import CalibrationRejectedError
 from echolume_messages.types import Frame
-from echolume_processing.optical import rig_frame, stripe
+from echolume_processing.optical import rig_frame
+from echolume_processing.optical.align import plane_alignment
 from echolume_processing.optical.board import Pattern
 from echolume_processing.optical.calibrate import CameraPair, calibrate_cameras
+from echolume_processing.optical.calibration_shots import BOARD, LASER, CalibrationShots, LitShot
 from echolume_processing.optical.laser import LaserFit, StripeOnBoard, fit_laser, stripe_on_board
-from echolume_processing.optical.stripe import Stripe
 
 RIG_BOARD = Pattern(9, 6, 20.0)
 """The board that belongs to the rig."""
-BOARD, LASER = "board-", "laser-"
 
 
 class OpticsReport(msgspec.Struct, kw_only=True):
@@ -37,9 +36,20 @@ class OpticsReport(msgspec.Struct, kw_only=True):
     baseline_mm: float
     square_mean_mm: float
     square_sd_mm: float
+    left_out_px: float
+    """Views left out in turn: RMS reprojection error; nan with fewer than five."""
+    left_out_mm: float
+    camera_sigmas: dict[str, float]
+    """Standard deviations of the cameras' parameters, by name with unit."""
     plane_rms_mm: float
     plane_leave_one_out_mm: float
     plane_field_sigma_mm: float
+    plane_shared_mm: float
+    """Standard deviation of the error that the points of one stripe share."""
+    parallel_deg: float
+    """Angle of the laser plane to YZ."""
+    parallel_mm: float
+    """By how much x varies over the field because of it."""
     stripes: int
     stripe_points: int
     turned: bool
@@ -54,16 +64,6 @@ class OpticsCalibration(NamedTuple):
     stereo_rms_px: float
     laser: LaserCalibration
     report: OpticsReport
-
-
-@dataclass
-class _Shots:
-    """Camera pairs of the calibration scan: board images summed by pose, stripes by pose and guide position."""
-
-    boards: dict[str, list[tuple[Frame, Frame]]] = field(default_factory=dict[str, list[tuple[Frame, Frame]]])
-    stripes: dict[str, list[tuple[float, Stripe, Stripe]]] = field(
-        default_factory=dict[str, list[tuple[float, Stripe, Stripe]]]
-    )
 
 
 def calibrate_optics(records: Iterable[Message] | Path, board: Pattern = RIG_BOARD) -> OpticsCalibration:
@@ -87,24 +87,32 @@ def calibrate_optics(records: Iterable[Message] | Path, board: Pattern = RIG_BOA
     CalibrationRejectedError
         If views or stripes are missing or do not determine the calibration; the reason is in the message.
     """
-    shots = _gather(_frames(records) if isinstance(records, Path) else records)
-    names = sorted(shots.boards)
-    if not names or not shots.stripes:
+    shots = CalibrationShots()
+    for message in _frames(records) if isinstance(records, Path) else records:
+        shots.take(message)
+    return calibrate_shots(shots, board)
+
+
+def calibrate_shots(shots: CalibrationShots, board: Pattern = RIG_BOARD) -> OpticsCalibration:
+    """Calibrate cameras and laser from what has been gathered so far; see `calibrate_optics`."""
+    boards, stripes = shots.by_pose()
+    names = sorted(boards)
+    if not names or not stripes:
         raise CalibrationRejectedError(
-            f"calibrate: found {len(names)} passes `{BOARD}NN` and {len(shots.stripes)} passes `{LASER}NN` with camera "
+            f"calibrate: found {len(names)} passes `{BOARD}NN` and {len(stripes)} passes `{LASER}NN` with camera "
             "pairs: is this the archive of a calibration scan?"
         )
-    images = [[_mean([pair[side] for pair in shots.boards[name]]) for name in names] for side in (0, 1)]
+    images = [[_mean([pair[side] for pair in boards[name]]) for name in names] for side in (0, 1)]
     pair = calibrate_cameras(images[0], images[1], (board.columns, board.rows), board.square_mm, names)
     if f"{BOARD}00" not in [v.name for v in pair.views]:
         raise CalibrationRejectedError(
             f"calibrate: pose `{BOARD}00` defines the rig frame and cannot be left out: "
             f"{pair.rejected.get(f'{BOARD}00', 'the pass is missing')}"
         )
-    return _in_rig_frame(pair, shots, board)
+    return _in_rig_frame(pair, stripes, board)
 
 
-def _in_rig_frame(pair: CameraPair, shots: _Shots, board: Pattern) -> OpticsCalibration:
+def _in_rig_frame(pair: CameraPair, stripes: dict[str, list[LitShot]], board: Pattern) -> OpticsCalibration:
     poses = dict(zip((v.name.removeprefix(BOARD) for v in pair.views), pair.left_from_board, strict=True))
     rig_from_left = rig_frame.rig_from_jig(board) @ np.linalg.inv(poses["00"])
     cameras = rig_frame.moved(pair.left, rig_from_left), rig_frame.moved(pair.right, rig_from_left)
@@ -117,7 +125,7 @@ def _in_rig_frame(pair: CameraPair, shots: _Shots, board: Pattern) -> OpticsCali
             ),
         )
         for number, pose in poses.items()
-        for x_mm, *found in shots.stripes.get(number, [])
+        for x_mm, *found in stripes.get(number, [])
     ]
     fit = fit_laser(on_boards)
     turned = fit.calibration.guide_direction[0] < 0
@@ -131,6 +139,7 @@ def _in_rig_frame(pair: CameraPair, shots: _Shots, board: Pattern) -> OpticsCali
 
 
 def _report(pair: CameraPair, fit: LaserFit, turned: bool) -> OpticsReport:
+    parallel = plane_alignment(np.array(fit.calibration.normal))
     return OpticsReport(
         views=[v.name for v in pair.views],
         rejected=pair.rejected,
@@ -140,9 +149,15 @@ def _report(pair: CameraPair, fit: LaserFit, turned: bool) -> OpticsReport:
         baseline_mm=pair.baseline_mm,
         square_mean_mm=pair.square_mm[0],
         square_sd_mm=pair.square_mm[1],
+        left_out_px=pair.left_out.rms_px,
+        left_out_mm=pair.left_out.rms_mm,
+        camera_sigmas=pair.covariance.sigmas,
         plane_rms_mm=fit.calibration.rms_mm,
         plane_leave_one_out_mm=fit.leave_one_out_mm,
         plane_field_sigma_mm=fit.field_sigma_mm,
+        plane_shared_mm=fit.shared_mm,
+        parallel_deg=parallel.angle_deg,
+        parallel_mm=parallel.over_field_mm,
         stripes=fit.stripes,
         stripe_points=fit.points,
         turned=turned,
@@ -153,47 +168,6 @@ def _frames(path: Path) -> Iterable[Message]:
     from echolume_messages import archive  # only reading from a file needs mcap
 
     return archive.read(path, {topics.CAMERA_LEFT.name, topics.CAMERA_RIGHT.name})
-
-
-def _gather(records: Iterable[Message]) -> _Shots:
-    """Pair the frames by trigger and attempt; a later attempt at a trigger replaces an earlier one."""
-    shots = _Shots()
-    waiting: dict[tuple[int, int], dict[str, Message]] = {}
-    best: dict[tuple[str, int], tuple[int, tuple[Frame, Frame] | tuple[float, Stripe, Stripe]]] = {}
-    for message in records:
-        header = message.header
-        if not header.pass_name.startswith((BOARD, LASER)) or message.topic.service != topics.CAMERA_LEFT.service:
-            continue
-        pair = waiting.setdefault((header.trigger, header.attempt), {})
-        pair[message.topic.name] = message
-        if len(pair) < 2:
-            continue
-        del waiting[header.trigger, header.attempt]
-        key = header.pass_name, header.trigger
-        if key in best and best[key][0] > header.attempt:
-            continue
-        left, right = pair[topics.CAMERA_LEFT.name], pair[topics.CAMERA_RIGHT.name]
-        frames = left.payload.astype(np.uint8, copy=False), right.payload.astype(np.uint8, copy=False)
-        if header.pass_name.startswith(BOARD):
-            best[key] = header.attempt, frames
-        else:
-            best[key] = header.attempt, (_guide(left), stripe.extract(frames[0]), stripe.extract(frames[1]))
-    for (name, _), (_, shot) in sorted(best.items(), key=lambda item: item[0]):
-        if len(shot) == 2:
-            shots.boards.setdefault(name, []).append(shot)
-        else:
-            shots.stripes.setdefault(name.removeprefix(LASER), []).append(shot)
-    return shots
-
-
-def _guide(message: Message) -> float:
-    x_mm = message.header.source.x_mm
-    if x_mm is None:
-        raise CalibrationRejectedError(
-            f"calibrate: pass {message.header.pass_name!r}, trigger {message.header.trigger}: the frame carries no "
-            "guide position"
-        )
-    return x_mm
 
 
 def _mean(frames: list[Frame]) -> Frame:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import cast
 
 import cv2
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from echolume_messages.errors import ConfigError
 from echolume_messages.geometry import Points3
 from echolume_messages.types import Frame
-from echolume_processing.optical.board import Corners, grid_neighbours
+from echolume_processing.optical.board import Corners, grid_mm, grid_neighbours
 from echolume_processing.optical.corner_fit import REACH, refine_corners
 
 MIN_CORNERS = 12
@@ -69,8 +70,9 @@ class CharucoPattern:
     @property
     def corners_mm(self) -> Points3:
         """Inner corners (rows * columns, 3), board frame; row after row from the top, x fastest."""
-        y, x = np.mgrid[0 : self.rows, 0 : self.columns].astype(np.float64) * self.square_mm
-        return np.stack([x.ravel(), y[::-1].ravel(), np.zeros(x.size)], axis=1)
+        grid = grid_mm(self.columns, self.rows, self.square_mm)
+        grid[:, 1] = (self.rows - 1) * self.square_mm - grid[:, 1]
+        return grid
 
     @property
     def neighbours(self) -> NDArray[np.int64]:
@@ -84,22 +86,24 @@ class CharucoPattern:
 
     def find(self, image: Frame) -> Corners | None:
         """The corners that are to be seen, or None if they are fewer than `MIN_CORNERS`."""
-        found, ids, _, _ = cv2.aruco.CharucoDetector(self.board).detectBoard(image)
-        if ids is None or len(ids) < MIN_CORNERS:
+        points, ids, *_ = cast("tuple[object, ...]", cv2.aruco.CharucoDetector(self.board).detectBoard(image))
+        if points is None or ids is None:
             return None
-        index = np.reshape(np.asarray(ids, dtype=np.int64), -1)
-        order = np.argsort(index)
-        index = index[order]
-        near = np.reshape(np.asarray(found, dtype=np.float64), (-1, 2))[order]
-        known = np.reshape(self.board.matchImagePoints(near[:, None].astype(np.float32), ids[order])[0], (-1, 3))[:, :2]
+        which = np.reshape(np.asarray(ids, dtype=np.int64), -1)
+        order = np.argsort(which)
+        which = which[order]
+        near = np.reshape(np.asarray(points, dtype=np.float64), (-1, 2))[order]
+        if len(which) < MIN_CORNERS:
+            return None
+        known = grid_mm(self.columns, self.rows, self.square_mm)[which, :2]
         if np.linalg.matrix_rank(known - known.mean(axis=0)) < 2:
             return None
         step = self._squares_px(known, near)
         reach = min(REACH, OF_THE_GAP * 0.5 * (1 - self.marker_mm / self.square_mm))
-        fine, blur_px = refine_corners(image, near, *step, reach)
+        fine, blur_px = refine_corners(image, near, step[0], step[1], reach)
         fitted = np.isfinite(blur_px)
         blur = float(np.median(blur_px[fitted])) if fitted.any() else float("nan")
-        return Corners(index, fine, blur, float(fitted.mean()))
+        return Corners(which, fine, blur, float(fitted.mean()))
 
     def _squares_px(self, known: NDArray[np.float64], seen: NDArray[np.float64]) -> list[NDArray[np.float64]]:
         """One square along x and y at each corner, in the image, by the homography of all of them."""

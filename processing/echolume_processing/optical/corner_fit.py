@@ -63,8 +63,8 @@ def _window(image: Frame, x0: float, y0: float, half_u: Value, half_v: Value, ou
         return 0
     reach_x, reach_y = abs(half_u[0]) + abs(half_v[0]), abs(half_u[1]) + abs(half_v[1])
     count = 0
-    for row in range(max(int(math.ceil(y0 - reach_y)), 0), min(int(y0 + reach_y), height - 1) + 1):
-        for column in range(max(int(math.ceil(x0 - reach_x)), 0), min(int(x0 + reach_x), width - 1) + 1):
+    for row in range(max(math.ceil(y0 - reach_y), 0), min(int(y0 + reach_y), height - 1) + 1):
+        for column in range(max(math.ceil(x0 - reach_x), 0), min(int(x0 + reach_x), width - 1) + 1):
             x, y = column - x0, row - y0
             a, b = (x * half_v[1] - y * half_v[0]) / det, (half_u[0] * y - half_u[1] * x) / det
             if abs(a) < 1.0 and abs(b) < 1.0 and count < out.shape[0]:
@@ -219,6 +219,6 @@ def refine_corners(
     for name, value in (("along_x_px", along_x_px), ("along_y_px", along_y_px)):
         require_shape(name, value, (len(points_px), 2))
     out, blur_px = np.empty((len(points_px), 2)), np.empty(len(points_px))
-    given = [np.ascontiguousarray(a, dtype=np.float64) for a in (points_px, along_x_px, along_y_px)]
-    _refine(np.ascontiguousarray(image), *given, reach, out, blur_px)
+    points, u, v = (np.ascontiguousarray(a, dtype=np.float64) for a in (points_px, along_x_px, along_y_px))
+    _refine(np.ascontiguousarray(image), points, u, v, reach, out, blur_px)
     return out, blur_px

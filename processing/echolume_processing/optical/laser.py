@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from echolume_messages.errors import CalibrationRejectedError
 from echolume_messages.geometry import Matrix, Points3, require_shape
 from echolume_processing.optical.board import Pattern
 from echolume_processing.optical.camera import Camera
+from echolume_processing.optical.plane_fit import grouped_covariance, robust_fit
 from echolume_processing.optical.stripe import Stripe
 
 Values = NDArray[np.float64]
@@ -28,10 +30,10 @@ FIELD_MM = 100.0
 FIELD_HEIGHT_MM = 40.0
 MAX_FIELD_SIGMA_MM = 0.15
 MAX_RMS_MM = 0.3
-FLOOR_MM = 0.02
-HUBER = 1.5
-ROUNDS = 30
-CUTOFF = 5.0
+FLOOR_MM = 0.005
+"""Least error that the points of a stripe are taken to share."""
+MIN_BOARDS = 3
+MAX_LEFT_OUT_MM = 0.3
 
 
 @dataclass(frozen=True)
@@ -50,20 +52,29 @@ class LaserFit:
     Attributes
     ----------
     calibration : LaserCalibration
-        n.X = offset_mm + s (n.g). Stripes tell only n.g of the guide's direction, so g is given along n.
-    leave_one_out_mm : float
-        RMS distance of each board's points from the plane fitted to the other boards; nan with fewer than three.
+        n.X = offset_mm + s (n.g), with its covariance. Stripes tell only n.g of the guide's direction, so g is given
+        along n.
+    left_out_mm : dict
+        Distance of each board's stripes from the plane fitted to the other boards; empty with fewer than three boards.
     field_sigma_mm : float
         Largest predicted sigma of the plane's position within the field.
+    shared_mm : float
+        Standard deviation of the error that the points of one stripe share.
     stripes, points : int
         How many were used.
     """
 
     calibration: LaserCalibration
-    leave_one_out_mm: float
+    left_out_mm: dict[str, float]
     field_sigma_mm: float
+    shared_mm: float
     stripes: int
     points: int
+
+    @property
+    def leave_one_out_mm(self) -> float:
+        """RMS of `left_out_mm`; nan where that is empty."""
+        return float(np.sqrt(np.mean(np.square(list(self.left_out_mm.values()))))) if self.left_out_mm else float("nan")
 
 
 def stripe_on_board(camera: Camera, found: Stripe, rig_from_board: Matrix, board: Pattern) -> Points3:
@@ -109,7 +120,8 @@ def fit_laser(stripes: Sequence[StripeOnBoard]) -> LaserFit:
     Raises
     ------
     CalibrationRejectedError
-        If the poses leave a direction of the plane open, or the points do not lie on any such plane.
+        If the poses leave a direction of the plane open, the points do not lie on any such plane, or a board's do
+        not lie on the plane found without it.
 
     Notes
     -----
@@ -128,16 +140,20 @@ def fit_laser(stripes: Sequence[StripeOnBoard]) -> LaserFit:
             f"calibrate laser: {len(used)} of {len(stripes)} stripes have {MIN_POINTS} points on a board, needs 4: "
             "check the exposure, and that the line meets the board"
         )
-    points = np.concatenate([s.points_mm for s in used])
-    x_mm = np.concatenate([np.full(len(s.points_mm), s.x_mm) for s in used])
+    points, x_mm = _stacked(used)
     design = _design(points, x_mm)
     _require_spread(design)
-    weights, beta, sigma = _robust(design, points[:, 0])
+    fit = robust_fit(design, points[:, 0])
+    beta = fit.beta
     normal_x = 1.0 / float(np.sqrt(1 + beta[2] ** 2 + beta[3] ** 2))
-    kept = weights > 0
+    kept = fit.weights > 0
     residual_mm = (points[:, 0] - design @ beta)[kept] * normal_x
     rms_mm = float(np.sqrt(np.mean(residual_mm**2)))
-    field_sigma_mm = _field_sigma(design[kept], max(sigma, FLOOR_MM), len(used))
+    ends = np.cumsum([0, *(len(s.points_mm) for s in used)])
+    groups = [slice(int(a), int(b)) for a, b in pairwise(ends)]
+    of_x, shared_mm = grouped_covariance(fit, design, points[:, 0], groups, FLOOR_MM)
+    covariance = of_x * normal_x**2
+    field_sigma_mm = _field_sigma(covariance)
     if rms_mm > MAX_RMS_MM:
         raise CalibrationRejectedError(
             f"calibrate laser: points lie {rms_mm:.2f} mm from the best plane, at most {MAX_RMS_MM} mm is accepted: "
@@ -162,8 +178,22 @@ def fit_laser(stripes: Sequence[StripeOnBoard]) -> LaserFit:
         offset_mm=float(beta[0]) * normal_x,
         guide_direction=(float(guide[0]), float(guide[1]), float(guide[2])),
         rms_mm=rms_mm,
+        plane_covariance=covariance.tolist(),
     )
-    return LaserFit(calibration, _leave_one_out(used), field_sigma_mm, len(used), int(kept.sum()))
+    left_out_mm = _leave_one_out(used)
+    _require_accepted(left_out_mm)
+    return LaserFit(calibration, left_out_mm, field_sigma_mm, shared_mm, len(used), int(kept.sum()))
+
+
+def _require_accepted(left_out_mm: dict[str, float]) -> None:
+    """Refuse a plane that does not hold for a board it was not fitted to."""
+    worst = max(left_out_mm, key=left_out_mm.__getitem__, default=None)
+    if worst is not None and left_out_mm[worst] > MAX_LEFT_OUT_MM:
+        raise CalibrationRejectedError(
+            f"calibrate laser: rejected: the stripes on board {worst} lie {left_out_mm[worst]:.3f} mm from the plane "
+            f"found without it, at most {MAX_LEFT_OUT_MM} mm is accepted: did that board move between its image and "
+            "its stripes, or are the other boards too much alike?"
+        )
 
 
 def _design(points: Points3, x_mm: Values) -> Values:
@@ -190,52 +220,34 @@ def _require_spread(design: Values) -> None:
             )
 
 
-def _robust(design: Values, target: Values) -> tuple[Values, Values, float]:
-    """Weights (1 used, 0 cut), solution and scale of a Huber fit that ends with a cut at CUTOFF sigmas."""
-    weights = np.ones(len(target))
-    beta, residual, sigma = _weighted(design, target, weights)
-    for _ in range(ROUNDS):
-        weights = np.minimum(1.0, HUBER * sigma / np.maximum(residual, 1e-12))
-        before = beta
-        beta, residual, sigma = _weighted(design, target, weights)
-        if np.all(np.abs(beta - before) <= 1e-9 * (1 + np.abs(beta))):
-            break
-    weights = (residual < CUTOFF * sigma).astype(np.float64)
-    beta, _, sigma = _weighted(design, target, weights)
-    return weights, beta, sigma
-
-
-def _weighted(design: Values, target: Values, weights: Values) -> tuple[Values, Values, float]:
-    """Solution, absolute residuals and their robust scale."""
-    root = np.sqrt(weights)
-    beta = np.asarray(np.linalg.lstsq(design * root[:, None], target * root, rcond=None)[0], dtype=np.float64)
-    residual = np.abs(target - design @ beta)
-    return beta, residual, max(1.4826 * float(np.median(residual)), 1e-6)
-
-
-def _field_sigma(design: Values, sigma_mm: float, stripes: int) -> float:
-    """Largest predicted sigma of the plane within the field; a stripe's errors are shared, so it counts twice only."""
-    per_stripe = len(design) / (2 * stripes)
-    covariance = sigma_mm**2 * per_stripe * np.linalg.inv(design.T @ design)
+def _field_sigma(covariance: Values) -> float:
+    """Largest predicted sigma of the plane's position within the field."""
     corners = np.array(
         [(1.0, s, y, z) for s in (-FIELD_MM, FIELD_MM) for y in (-FIELD_MM, FIELD_MM) for z in (0.0, FIELD_HEIGHT_MM)]
     )
     return float(np.sqrt(np.max(np.einsum("ij,jk,ik->i", corners, covariance, corners))))
 
 
-def _leave_one_out(stripes: Sequence[StripeOnBoard]) -> float:
+def _leave_one_out(stripes: Sequence[StripeOnBoard]) -> dict[str, float]:
+    """RMS over a board's stripes of their median distance from the plane fitted to the other boards, by board."""
     names = sorted({s.board for s in stripes})
-    if len(names) < 3:
-        return float("nan")
-    squares: list[float] = []
+    left_out: dict[str, float] = {}
+    if len(names) < MIN_BOARDS:
+        return left_out
     for name in names:
-        rest = [s for s in stripes if s.board != name]
-        points = np.concatenate([s.points_mm for s in rest])
-        x_mm = np.concatenate([np.full(len(s.points_mm), s.x_mm) for s in rest])
-        _, beta, _ = _robust(_design(points, x_mm), points[:, 0])
+        points, x_mm = _stacked([s for s in stripes if s.board != name])
+        beta = robust_fit(_design(points, x_mm), points[:, 0]).beta
         scale = 1.0 / float(np.sqrt(1 + beta[2] ** 2 + beta[3] ** 2))
-        for s in stripes:
-            if s.board == name:
-                off = s.points_mm[:, 0] - _design(s.points_mm, np.full(len(s.points_mm), s.x_mm)) @ beta
-                squares.append(float(np.median(off) * scale) ** 2)
-    return float(np.sqrt(np.mean(squares)))
+        off_mm = [
+            float(np.median(s.points_mm[:, 0] - _design(s.points_mm, np.full(len(s.points_mm), s.x_mm)) @ beta))
+            for s in stripes
+            if s.board == name
+        ]
+        left_out[name] = scale * float(np.sqrt(np.mean(np.square(off_mm))))
+    return left_out
+
+
+def _stacked(stripes: Sequence[StripeOnBoard]) -> tuple[Points3, Values]:
+    """Points (n, 3) of all stripes, and the guide's position (n,) at each."""
+    points = np.concatenate([s.points_mm for s in stripes])
+    return points, np.concatenate([np.full(len(s.points_mm), s.x_mm) for s in stripes])

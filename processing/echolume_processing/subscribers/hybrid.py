@@ -17,6 +17,7 @@ from echolume_messages.errors import EcholumeError
 from echolume_messages.rig import Rig
 from echolume_messages.types import Structured
 from echolume_processing.evidence import Evidence, read_start
+from echolume_processing.hybrid.warm_up import warm_up
 from echolume_processing.ping import ping_from_record
 from echolume_processing.review import REPORTS
 from echolume_processing.session import conclude
@@ -232,4 +233,10 @@ def main(
 ) -> int:
     """Run the subscriber until SIGTERM or SIGINT; files go to `out`, by default the working folder."""
     folder = out or Path.cwd()
-    return run_subscriber("hybrid", lambda b, r: HybridSubscriber(b, r, folder), bus, rig, stop)
+
+    def make(bus: Bus, rig: Rig) -> HybridSubscriber:
+        # beside the first scan, not before it: nothing is fused until that scan is over
+        threading.Thread(target=warm_up, name="hybrid-warm-up", daemon=True).start()
+        return HybridSubscriber(bus, rig, folder)
+
+    return run_subscriber("hybrid", make, bus, rig, stop)

@@ -15,6 +15,7 @@ import pytest
 from echolume_messages import topics
 from echolume_messages.bus import Bus, Subscription, connect
 from echolume_messages.bus.router import open_router
+from echolume_messages.clock import VirtualClock
 from echolume_messages.codec import decode_header
 from echolume_messages.errors import (
     CommandRefusedError,
@@ -424,3 +425,19 @@ def test_a_process_that_is_stopped_stalls_nobody(endpoint: str, rig: str) -> Non
         assert found == list(range(61))
         assert sub.stats["lost"] == 0
         assert longest_s < 0.25
+
+
+def test_a_wall_clock_that_jumps_changes_its_own_stamp_and_nothing_else(endpoint: str, rig: str) -> None:
+    clock = VirtualClock()
+    with connect(endpoint, rig) as lab, connect(endpoint, rig, clock=clock) as device:
+        sub = lab.subscribe([topics.ECHOES])
+        pub = device.publisher(topics.ECHOES)
+        for k in range(6):
+            if k == 3:
+                clock.jump_wall(-3600.0)
+            clock.advance(0.1)
+            pub.put(echoes(k), trigger=k)
+        found = [message.header for _ in range(6) if (message := sub.get(DEADLINE_S)) is not None]
+    assert [h.trigger for h in found] == list(range(6))
+    assert np.diff([h.t_ns for h in found]).tolist() == [10**8] * 5
+    assert np.diff([h.t_wall_ns for h in found]).tolist() == [10**8] * 2 + [10**8 - 3600 * 10**9] + [10**8] * 2

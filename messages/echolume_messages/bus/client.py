@@ -16,17 +16,21 @@ from echolume_messages.bus.journal_server import JournalServer, JournalSource
 from echolume_messages.bus.publisher import Outbox, Publisher
 from echolume_messages.bus.session import open_client
 from echolume_messages.bus.subscription import Subscription
+from echolume_messages.clock import Clock, SystemClock
 from echolume_messages.topics import Topic
 
 
 class Bus:
     """A client's session on the bus of one rig. Made by `connect`; close it, or use it in a ``with`` block."""
 
-    def __init__(self, session: zenoh.Session, rig: str, journal_s: float, journal_mib: int) -> None:
+    def __init__(
+        self, session: zenoh.Session, rig: str, journal_s: float, journal_mib: int, clock: Clock | None = None
+    ) -> None:
         self.rig = rig
         self.boot = secrets.token_hex(6)
         """Tells this session's sequence numbers from those of a session before or after it."""
         self._session = session
+        self._clock = clock or SystemClock()
         limit_bytes = journal_mib << 20
         self._journal = Journal(journal_s, limit_bytes)
         self._outbox = Outbox(session, limit_bytes)
@@ -44,7 +48,7 @@ class Bus:
         with self._lock:
             found = self._publishers.get(topic.name)
             if found is None:
-                found = Publisher(self._session, self._outbox, self._journal, self.rig, self.boot, topic)
+                found = Publisher(self._session, self._outbox, self._journal, self.rig, self.boot, self._clock, topic)
                 self._publishers[topic.name] = found
             return found
 
@@ -184,6 +188,7 @@ def connect(
     shared_memory: bool = False,
     journal_s: float = 5.0,
     journal_mib: int = 256,
+    clock: Clock | None = None,
 ) -> Bus:
     """Join the bus of a rig.
 
@@ -199,6 +204,8 @@ def connect(
         Carry large records to clients on the same machine in shared memory.
     journal_s, journal_mib
         How much of what this session publishes is kept for subscribers that missed it.
+    clock
+        Stamps the records; the machine's, if not given.
 
     Raises
     ------
@@ -213,4 +220,4 @@ def connect(
             with bus.subscribe([topics.CAMERA_LEFT]) as frames:
                 message = frames.get(timeout_s=10)
     """
-    return Bus(open_client(endpoint, timeout_s, shared_memory), rig, journal_s, journal_mib)
+    return Bus(open_client(endpoint, timeout_s, shared_memory), rig, journal_s, journal_mib, clock)

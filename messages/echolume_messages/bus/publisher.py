@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from echolume_messages import topics
 from echolume_messages.bus.journal import Journal, Record
 from echolume_messages.bus.journal_server import JSON_ENCODING, Beat, JournalServer, journal_key
+from echolume_messages.clock import Clock
 from echolume_messages.codec import ENCODING, check, encode, encode_header, json_array
 from echolume_messages.errors import BusError
 from echolume_messages.header import Header, Source
@@ -135,9 +136,10 @@ class Publisher:
     """Publishes one topic. Made by `Bus.publisher`."""
 
     def __init__(
-        self, session: zenoh.Session, outbox: Outbox, journal: Journal, rig: str, boot: str, topic: Topic
+        self, session: zenoh.Session, outbox: Outbox, journal: Journal, rig: str, boot: str, clock: Clock, topic: Topic
     ) -> None:
         self.topic = topic
+        self._clock = clock
         self.rig = rig
         self.beat_due_ns = time.monotonic_ns() + BEAT_NS
         self._active_ns = 0
@@ -182,7 +184,7 @@ class Publisher:
         """
         check(array, self.topic)
         payload = encode(array)
-        now_ns = time.monotonic_ns()
+        now_ns = self._clock.monotonic_ns()
         captured_ns = now_ns if t_ns is None else t_ns
         with self._lock:
             seq = self._seq
@@ -190,7 +192,7 @@ class Publisher:
                 stream=self.topic.name,
                 seq=seq,
                 t_ns=captured_ns,
-                t_wall_ns=time.time_ns() - (now_ns - captured_ns),
+                t_wall_ns=self._clock.wall_ns() - (now_ns - captured_ns),
                 boot=self._boot,
                 scan=scan,
                 pass_name=pass_name,
@@ -204,8 +206,8 @@ class Publisher:
             self._outbox.add(self, record)
             self._journal.add(self.topic.name, record)
             self._seq += 1
-            self.beat_due_ns = now_ns + BEAT_FIRST_NS
-            self._active_ns = now_ns
+            self._active_ns = time.monotonic_ns()
+            self.beat_due_ns = self._active_ns + BEAT_FIRST_NS
         return seq
 
     def put_json(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from echolume_processing.commands.calibrate import read_pairs
+from echolume_processing.commands.image_pairs import read_pairs
 from echolume_processing.optical.calibrate import calibrate_cameras
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -1,0 +1,104 @@
+"""Calibrate cameras and laser from the passes board-NN and laser-NN of an archive, or while the scan runs.
+
+Without an archive the passes are taken from the bus: start `echolume scan` with the plan calibrate.toml in another
+terminal. After each board the operator is told what is missing. The session ends with the scan, or by Ctrl-C with
+what there is. Folders of images hold no guide positions, so this command takes none.
+
+examples:
+  echolume calibrate laser calibrate.mcap --into calibration.json
+  echolume calibrate laser --rig rig.toml --into calibration.json
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from echolume_messages.rig_option import add_rig, load_rig
+from echolume_processing.commands.board_option import add_board, chessboard
+from echolume_processing.commands.report_table import say_aside, write_table
+
+if TYPE_CHECKING:
+    from echolume_processing.optical.board import Pattern
+    from echolume_processing.optical.calibrate_rig import OpticsCalibration
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
+    parser.description = __doc__
+    parser.add_argument("archive", type=Path, nargs="?", help="archive (.mcap) of a calibration scan")
+    add_board(parser, charuco=False)
+    add_rig(parser)
+    parser.add_argument("--into", type=Path, metavar="FILE", help="calibration file whose optical parts to replace")
+    parser.add_argument("--json", action="store_true", help="print the figures as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Calibrate, write the calibration file if there is one, and report."""
+    import msgspec
+
+    from echolume_messages import calibration as calibration_file
+    from echolume_processing.optical.calibrate_rig import calibrate_optics
+
+    board = chessboard(args)
+    before = calibration_file.load(args.into) if args.into else None
+    found = _live(args, board) if args.archive is None else calibrate_optics(args.archive, board)
+    if before is not None:
+        updated = msgspec.structs.replace(
+            before, left=found.left, right=found.right, stereo_rms_px=found.stereo_rms_px, laser=found.laser
+        )
+        calibration_file.save(updated, args.into)
+    if args.json:
+        figures = msgspec.to_builtins(found.report) | {"laser": msgspec.to_builtins(found.laser)}
+        sys.stdout.write(json.dumps(figures, indent=1) + "\n")
+        return 0
+    lines = rows(found)
+    if args.into:
+        lines.append(("written", str(args.into)))
+    write_table(lines, found.report.rejected)
+    return 0
+
+
+def _live(args: argparse.Namespace, board: Pattern) -> OpticsCalibration:
+    import threading
+
+    from echolume_messages.bus import connect
+    from echolume_messages.bus.lifetime import stopped_by_signals
+    from echolume_processing.calibrate_live import LedgerEnd, camera_pairs, gather_optics
+
+    rig = load_rig(args.rig)
+    stop = threading.Event()
+    with stopped_by_signals(stop), connect(rig.bus.endpoint, rig.name) as bus:
+        ended = LedgerEnd(bus)
+        say_aside(
+            "waiting for passes board-NN and laser-NN; start the scan calibrate.toml; Ctrl-C ends with what there is"
+        )
+        return gather_optics(camera_pairs(bus), board, say_aside, stop, ended)
+
+
+def rows(found: OpticsCalibration) -> list[tuple[str, str]]:
+    """The report's lines."""
+    report, laser = found.report, found.laser
+    per_guide = sum(a * b for a, b in zip(laser.normal, laser.guide_direction, strict=True))
+    normal = ", ".join(f"{value:.6f}" for value in laser.normal)
+    out = [
+        ("views used", f"{len(report.views)} of {len(report.views) + len(report.rejected)}"),
+        ("left RMS", f"{report.left_rms_px:.4f} px"),
+        ("right RMS", f"{report.right_rms_px:.4f} px"),
+        ("stereo RMS", f"{report.stereo_rms_px:.4f} px"),
+        ("views left out in turn", f"{report.left_out_px:.4f} px, {report.left_out_mm:.4f} mm RMS"),
+        ("baseline", f"{report.baseline_mm:.3f} mm"),
+        ("squares, triangulated", f"{report.square_mean_mm:.3f} mm +- {report.square_sd_mm:.3f} mm"),
+        ("laser plane", f"({normal}) . X = {laser.offset_mm:.4f} mm + {per_guide:.6f} s"),
+        ("plane RMS", f"{report.plane_rms_mm:.4f} mm over {report.stripe_points} points of {report.stripes} stripes"),
+        ("boards left out in turn", f"plane within {report.plane_leave_one_out_mm:.4f} mm RMS"),
+        ("plane in the field", f"sigma at most {report.plane_field_sigma_mm:.4f} mm"),
+        ("parallel to YZ", f"within {report.parallel_deg:.3f} deg, {report.parallel_mm:.3f} mm over the field"),
+    ]
+    if report.turned:
+        out.append(("rig frame", "turned by half a turn: the guide runs against the board's x"))
+    out.append(("verdict", "accepted"))
+    return out

@@ -8,7 +8,6 @@ import pytest
 
 from echolume_drivers.emulated.board_image import (
     BLACK,
-    PSF_SIGMA_PX,
     WHITE,
     board_at,
     board_light,
@@ -16,7 +15,9 @@ from echolume_drivers.emulated.board_image import (
     corners,
     render_board,
 )
+from echolume_drivers.emulated.flaws import Lens
 from echolume_drivers.emulated.optics import Side, optical_truth
+from echolume_drivers.emulated.stripe_image import LENS_SIGMA_PX
 
 SIDES: tuple[Side, Side] = ("left", "right")
 SEED = 5
@@ -57,11 +58,11 @@ def test_all_poses_are_above_the_bench_tilted_all_around_and_in_view_of_both_cam
 @pytest.mark.parametrize("side", SIDES)
 @pytest.mark.parametrize("pose", [0, 3, 8])
 def test_pixels_around_a_corner_are_the_print_blurred_by_the_lens(side: Side, pose: int) -> None:
-    camera, board = TRUTH.camera(side), board_at(POSES[pose])
+    camera, board = optical_truth(SEED, lens=Lens(focus_mm=None)).camera(side), board_at(POSES[pose])
     image = board_light(board, camera)
-    offsets = np.linspace(-4, 4, 121) * PSF_SIGMA_PX
+    offsets = np.linspace(-4, 4, 121) * LENS_SIGMA_PX
     du, dv = np.meshgrid(offsets, offsets)
-    weight = np.exp(-0.5 * (du**2 + dv**2) / PSF_SIGMA_PX**2)
+    weight = np.exp(-0.5 * (du**2 + dv**2) / LENS_SIGMA_PX**2)
     weight /= weight.sum()
     up, origin = POSES[pose][:3, 2], POSES[pose][:3, 3]
     for corner in camera.project(corners(board))[[0, 8, 22, 31, 45, 53]]:

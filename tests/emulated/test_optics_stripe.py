@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from echolume_drivers.emulated.flaws import FLAWLESS
 from echolume_drivers.emulated.optics import Side, optical_truth
 from echolume_drivers.emulated.scene import Material, SceneBuilder, demo, plate
 from echolume_drivers.emulated.sensor import READ_NOISE_DN, expose
@@ -189,7 +190,7 @@ def test_black_returns_nothing(side: Side) -> None:
     stripe = true_stripe(SCENE, TRUTH, side, 50.0)
     y_mm = stripe.points_mm[:, 1]
     assert not np.any((y_mm > -74.9) & (y_mm < -25.1))
-    frame = render_stripe(SCENE, TRUTH, side, 50.0, np.random.default_rng(0), 4e-3, True)
+    frame = render_stripe(SCENE, optical_truth(7, FLAWLESS), side, 50.0, np.random.default_rng(0), 4e-3, True)
     rows = TRUTH.camera(side).project(np.array([[50.0, -70.0, 20.0], [50.0, -30.0, 20.0]]))[:, 1]
     assert frame[int(rows[1]) : int(rows[0])].max() < 20
 

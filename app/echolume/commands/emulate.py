@@ -29,6 +29,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         default="wideband",
         help="ultrasonic transducers: 30-60 kHz, or the paper's 40 kHz narrow band",
     )
+    parser.add_argument("--room", choices=("dark", "bright"), default="dark", help="light around: dark lab, lamps on")
     parser.add_argument("--bare", action="store_true", help="without the relay that opens the laser line by itself")
 
 
@@ -46,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     from echolume_messages.files import make_folder
 
     out: Path = args.out
-    emulated = EmulatedRig(args.seed, args.scene, args.speed, args.pulse, out, bare=args.bare)
+    emulated = EmulatedRig(args.seed, args.scene, args.speed, args.pulse, out, bare=args.bare, room=args.room)
     make_folder(out)
     with emulated as rig:
         sys.stdout.write(

@@ -11,7 +11,13 @@ from numpy.typing import NDArray
 from echolume_drivers.emulated.optics import CameraTruth, OpticalTruth, Side, optical_truth
 from echolume_drivers.emulated.sensor import expose
 from echolume_drivers.emulated.stage import Board
-from echolume_drivers.emulated.stripe_image import AMBIENT_DN_PER_S, LAMP_DN_PER_S, STRIPE_DN_PER_S, stripe_light
+from echolume_drivers.emulated.stripe_image import (
+    LAMP_DN_PER_S,
+    LENS_SIGMA_PX,
+    STRIPE_DN_PER_S,
+    sensor_of,
+    stripe_light,
+)
 from echolume_drivers.emulated.stripe_kernels import images
 from echolume_messages.geometry import Matrix, apply, rotation_from_euler, transform
 from echolume_messages.types import Frame
@@ -23,7 +29,6 @@ COLUMNS, ROWS, SQUARE_MM = 9, 6, 20.0
 WHITE, BLACK, BACKING = 0.9, 0.06, 0.55
 """Albedo of the print, and of the matte plate around it."""
 BORDER_MM = 12.0
-PSF_SIGMA_PX = 0.7
 LASER_WIDTH_MM = 0.15
 
 _LINE_MM = 170.0
@@ -104,16 +109,27 @@ def render_board(
     Notes
     -----
     Each pixel's undistorted ray is met with the board's plane, and the checker is evaluated there as blurred by the
-    lens: corners are exact far below 0.01 px. The board's backing plate is larger than the field.
+    lens and, off the plane of focus, by its aperture: corners are exact far below 0.01 px. The board's backing plate
+    is larger than the field.
     """
-    light = AMBIENT_DN_PER_S if laser_on else AMBIENT_DN_PER_S + LAMP_DN_PER_S
-    lamp = board_light(board, truth.camera(side)) * np.float32(light * exposure_s)
+    camera = truth.camera(side)
+    lamp = board_light(board, camera)
+    even_dn = 0.0 if laser_on else LAMP_DN_PER_S * exposure_s
+    lamp *= _room(camera, truth.flaws.ambient_gradient, truth.flaws.ambient_dn_per_s * exposure_s, even_dn)
     if laser_on:
         pieces, brightness = _stripe_pieces(board, truth, side, x_mm)
         laser, touched = stripe_light(pieces, brightness * (STRIPE_DN_PER_S * exposure_s), truth, side)
     else:
         laser, touched = np.zeros_like(lamp), np.zeros((lamp.shape[0], 2), dtype=np.int64)
-    return expose(rng, lamp, laser, touched)
+    return expose(rng, lamp, laser, touched, sensor_of(truth, side, exposure_s))
+
+
+def _room(camera: CameraTruth, gradient: tuple[float, float], room_dn: float, even_dn: float) -> NDArray[np.float32]:
+    """Light on white (rows, columns): the room's, with its gradient, and even light."""
+    u = np.linspace(-0.5, 0.5, camera.width_px, dtype=np.float32)
+    v = np.linspace(-0.5, 0.5, camera.height_px, dtype=np.float32)
+    uneven = (gradient[0] * u + gradient[1] * v[:, None]).astype(np.float32)
+    return (room_dn + even_dn) + room_dn * uneven
 
 
 def board_light(board: Board, camera: CameraTruth) -> NDArray[np.float32]:
@@ -121,7 +137,7 @@ def board_light(board: Board, camera: CameraTruth) -> NDArray[np.float32]:
     camera_from_board = camera.camera_from_rig @ board.rig_from_board
     board_from_ray = np.linalg.inv(camera_from_board[:3, [0, 1, 3]]).astype(np.float64)
     image = np.empty((camera.height_px, camera.width_px), dtype=np.float32)
-    blur = PSF_SIGMA_PX / np.array([camera.matrix[0, 0], camera.matrix[1, 1]])
+    blur = np.array([LENS_SIGMA_PX, *camera.packed[21:23], camera.matrix[0, 0], camera.matrix[1, 1]])
     size = np.array([board.columns, board.rows], dtype=np.float64)
     _draw(camera.rays, board_from_ray, blur, size, board.square_mm, max(0.0, board.rig_from_board[2, 2]), image)
     return image
@@ -147,7 +163,8 @@ def _stripe_pieces(board: Board, truth: OpticalTruth, side: Side, x_mm: float) -
     size = np.array([board.columns, board.rows], dtype=np.float64)
     albedo = _albedo_along(local[:, :2], LASER_WIDTH_MM, size, board.square_mm)
     brightness = albedo * np.maximum(way @ up / far_mm, 0.0) * head[2] / far_mm
-    return images(truth.camera(side).packed, np.concatenate([ends[:-1], ends[1:]], axis=1)), brightness
+    spans = np.concatenate([ends[:-1], ends[1:]], axis=1)
+    return images(truth.camera(side).packed, spans, truth.stripe_sigma_px), brightness
 
 
 @numba.njit(cache=True, nogil=True)
@@ -235,8 +252,11 @@ def _draw(
             w = h[2, 0] * a + h[2, 1] * b + h[2, 2]
             x = (h[0, 0] * a + h[0, 1] * b + h[0, 2]) / w
             y = (h[1, 0] * a + h[1, 1] * b + h[1, 2]) / w
-            x_a, x_b = (h[0, 0] - x * h[2, 0]) / w * blur[0], (h[0, 1] - x * h[2, 1]) / w * blur[1]
-            y_a, y_b = (h[1, 0] - y * h[2, 0]) / w * blur[0], (h[1, 1] - y * h[2, 1]) / w * blur[1]
+            # 1 / w is the distance along the optical axis.
+            blur_px = math.sqrt(blur[0] ** 2 + (blur[1] * (1 - blur[2] * w)) ** 2)
+            s_a, s_b = blur_px / blur[3], blur_px / blur[4]
+            x_a, x_b = (h[0, 0] - x * h[2, 0]) / w * s_a, (h[0, 1] - x * h[2, 1]) / w * s_b
+            y_a, y_b = (h[1, 0] - y * h[2, 0]) / w * s_a, (h[1, 1] - y * h[2, 1]) / w * s_b
             blur_x, blur_y = math.sqrt(x_a * x_a + x_b * x_b), math.sqrt(y_a * y_a + y_b * y_b)
             slant = (x_a * y_a + x_b * y_b) / (blur_x * blur_y)
             vignette = 1.0 / (1.0 + a * a + b * b) ** 2

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from echolume_drivers.emulated.flaws import DARK_LAB, LAB_LENS, Flaws, Lens, hot_pixels
 from echolume_messages.geometry import (
     Matrix,
     Points3,
@@ -36,6 +37,9 @@ class CameraTruth:
     matrix: Matrix
     distortion: NDArray[np.float64]
     camera_from_rig: Matrix
+    lens: Lens = LAB_LENS
+    hot: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+    """Hot pixels: row, column, dark signal in DN per second."""
 
     @cached_property
     def centre_mm(self) -> NDArray[np.float64]:
@@ -44,10 +48,15 @@ class CameraTruth:
 
     @cached_property
     def packed(self) -> NDArray[np.float64]:
-        """All parameters in one row for the kernels: fx, fy, cx, cy, k1, k2, p1, p2, k3, then [R | t] row by row."""
+        """All parameters in one row for the kernels: fx, fy, cx, cy, k1, k2, p1, p2, k3, [R | t] row by row, focus."""
         m = self.matrix
         inner = np.array([m[0, 0], m[1, 1], m[0, 2], m[1, 2]])
-        return np.concatenate([inner, self.distortion, self.camera_from_rig[:3].ravel()])
+        return np.concatenate([inner, self.distortion, self.camera_from_rig[:3].ravel(), self.lens.focus_row(m[0, 0])])
+
+    @property
+    def grain_px(self) -> float:
+        """Width of a speckle grain on the sensor."""
+        return self.lens.grain_px(float(self.matrix[0, 0]))
 
     @cached_property
     def rays(self) -> NDArray[np.float64]:
@@ -84,6 +93,8 @@ class OpticalTruth:
     head_at_zero_mm: NDArray[np.float64]
     """The point that the light fan comes from when the guide stands at 0; it lies in the plane."""
     stripe_sigma_px: float
+    """Half width of the line in the plane of focus."""
+    flaws: Flaws = DARK_LAB
 
     def camera(self, side: Side) -> CameraTruth:
         """The left or the right camera."""
@@ -113,8 +124,11 @@ def distort(normalised: NDArray[np.float64], coefficients: NDArray[np.float64]) 
     )
 
 
-def optical_truth(seed: int) -> OpticalTruth:
-    """Draw the optics of an emulated rig: the nominal build plus the small errors that a calibration has to find."""
+def optical_truth(seed: int, flaws: Flaws = DARK_LAB, lens: Lens = LAB_LENS) -> OpticalTruth:
+    """Draw the optics of an emulated rig: the nominal build plus the small errors that a calibration has to find.
+
+    `flaws` and `lens` say what its pictures suffer from; they change nothing of the build.
+    """
     rng = np.random.default_rng([seed, 0x0B71C5])
     left = _camera(rng, -260.0)
     right = _camera(rng, 260.0)
@@ -123,7 +137,12 @@ def optical_truth(seed: int) -> OpticalTruth:
     head = np.array([0.0, 0.0, 500.0]) + rng.uniform(-2, 2, 3)
     offset_mm = float(rng.uniform(-0.8, 0.8))
     head[0] = (offset_mm - normal[1] * head[1] - normal[2] * head[2]) / normal[0]
-    return OpticalTruth(left, right, normal, offset_mm, guide, head, float(rng.uniform(1.6, 1.9)))
+    stripe_sigma_px = float(rng.uniform(1.6, 1.9))
+    sensors = np.random.default_rng([seed, 0x507])
+    left, right = (
+        replace(c, lens=lens, hot=hot_pixels(sensors, c.width_px, c.height_px, flaws)) for c in (left, right)
+    )
+    return OpticalTruth(left, right, normal, offset_mm, guide, head, stripe_sigma_px, flaws)
 
 
 def _camera(rng: np.random.Generator, x_mm: float, width_px: int = 1280, height_px: int = 1024) -> CameraTruth:

@@ -18,6 +18,7 @@ from echolume_drivers.emulated.board_image import board_at, board_poses, render_
 from echolume_drivers.emulated.camera_peer import CameraPeer
 from echolume_drivers.emulated.control import ADDRESS_FILE, ControlServer, Json
 from echolume_drivers.emulated.echoes import simulate_ping
+from echolume_drivers.emulated.flaws import ROOMS
 from echolume_drivers.emulated.grbl_peer import GrblPeer
 from echolume_drivers.emulated.optics import OpticalTruth, Side, optical_truth
 from echolume_drivers.emulated.robot_peer import RobotPeer
@@ -39,6 +40,7 @@ from echolume_messages.rig import (
 )
 
 Pulse = Literal["wideband", "paper"]
+Room = Literal["dark", "bright"]
 FASTEST = 1e6
 """Beyond this a speed is rather a slip of the pen."""
 
@@ -75,6 +77,8 @@ class EmulatedRig:
         Where rig.toml, the control's address and the archives go.
     bare
         Leave out the relay that opens the laser line when the host is gone.
+    room
+        The light around: a ``dark`` lab, or a ``bright`` room with its lamps on.
     """
 
     def __init__(
@@ -86,6 +90,7 @@ class EmulatedRig:
         directory: Path = Path(),
         *,
         bare: bool = False,
+        room: Room = "dark",
     ) -> None:
         if scene_name not in SCENES:
             raise ConfigError(f"emulated rig: unknown scene {scene_name!r}; known: {', '.join(SCENES)}")
@@ -97,7 +102,7 @@ class EmulatedRig:
         self._stage = Stage(seed, SCENES[scene_name](), speed)
         self._seed = seed
         self._poses = board_poses(seed)
-        self._truth = optical_truth(seed)
+        self._truth = optical_truth(seed, ROOMS[room])
         self._array_settings = ArraySettings(port="", pulse=pulse)
         self._bare = bare
         self._rig: Rig | None = None

@@ -7,16 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from echolume_drivers.emulated.flaws import SHARP_AT_MM
 from echolume_drivers.emulated.optics import OpticalTruth, Side
 from echolume_drivers.emulated.scene import Scene
-from echolume_drivers.emulated.sensor import expose
+from echolume_drivers.emulated.sensor import Sensor, expose
+from echolume_drivers.emulated.speckle import speckle_tile
+from echolume_drivers.emulated.stray_kernels import glints, second_stripes
 from echolume_drivers.emulated.stripe_kernels import cut, images, light, splat
 from echolume_messages.types import Frame
 
 STRIPE_DN_PER_S = 150.0 / 4e-3
 """Crest of the stripe on a white surface that the laser meets at right angles."""
-AMBIENT_DN_PER_S = 5.0 / 4e-3
-"""Room light that passes the cameras' filter."""
 LAMP_DN_PER_S = 168.0 / 8e-3
 """Bench lamp on white; it is wired to burn only while the laser is off."""
 SCENE_ALBEDO = 0.6
@@ -24,6 +25,15 @@ TRANSMISSION = 0.85
 """What a glass body lets through, once."""
 SURFACES = np.array([[1.0, 0.0], [0.0, 0.0], [1.0, 0.0], [0.35, 6.0]])
 """Diffuse albedo and specular strength by material: matte, black, (what lies under) glass, glossy."""
+WORN_EDGES = np.array([0.0, 4.0, 3.0, 4.0])
+"""Mirror strength of a worn edge by material, as `SURFACES`' second column."""
+GLASS_MIRROR = (10.0, 2000.0)
+"""Strength and exponent of the glass's mirror lobe at full reflection: polished, some degrees wide."""
+MIRRORS = np.array([1.0, 1.2, 0.0, 8.0])
+"""How much better than a matte wall a wall of each material shows the stripe's mirror image."""
+
+LENS_SIGMA_PX = 0.7
+"""Blur of the lens in focus."""
 
 _FAN_MM = (-150.0, 150.0)
 _PER_MM = 8
@@ -55,21 +65,81 @@ class StripeTruth:
         return out
 
 
+@dataclass(frozen=True)
+class _Shape:
+    """What the kernels need of scene, laser and eye."""
+
+    grid: NDArray[np.float64]
+    plane: NDArray[np.float64]
+    head: NDArray[np.float64]
+    top_mm: float
+    line_mm: float
+
+
+def _shape(scene: Scene, truth: OpticalTruth, side: Side, x_mm: float) -> _Shape:
+    return _Shape(
+        np.array([scene.x0_mm, scene.y0_mm, scene.cell_mm]),
+        np.append(truth.laser_normal, truth.plane_offset_mm(x_mm)),
+        truth.head_mm(x_mm),
+        max(0.0, float(scene.front_mm.max()), float(scene.optical_mm.max())) + 1e-6,
+        truth.stripe_sigma_px * SHARP_AT_MM / float(truth.camera(side).matrix[0, 0]),
+    )
+
+
 def _pieces(
     scene: Scene, truth: OpticalTruth, side: Side, x_mm: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Spans (n, 6) of the cut, their images (n, 3) and their brightness (n,)."""
-    grid = np.array([scene.x0_mm, scene.y0_mm, scene.cell_mm])
-    plane = np.append(truth.laser_normal, truth.plane_offset_mm(x_mm))
+    """Spans (n, 6) of the cut, their images (n, 4) and their brightness (n,)."""
+    spans, _, pieces, brightness = _direct(scene, truth, side, _shape(scene, truth, side, x_mm))
+    return spans, pieces, brightness
+
+
+def _direct(
+    scene: Scene, truth: OpticalTruth, side: Side, shape: _Shape
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Spans (n, 6) of the cut, their kinds (n, 3), images (n, 4) and brightness (n,)."""
     camera = truth.camera(side)
-    top_mm = max(0.0, float(scene.front_mm.max()), float(scene.optical_mm.max())) + 1e-6
-    relief_mm = top_mm - min(0.0, float(scene.optical_mm.min()))
-    spans, kinds = cut(scene.optical_mm, scene.material, grid, plane, _FAN_MM, _PER_MM, relief_mm)
+    relief_mm = shape.top_mm - min(0.0, float(scene.optical_mm.min()))
+    spans, kinds = cut(scene.optical_mm, scene.material, shape.grid, shape.plane, _FAN_MM, _PER_MM, relief_mm)
     brightness = light(
-        scene.optical_mm, scene.front_mm, scene.material, grid, spans, kinds,
-        truth.head_mm(x_mm), camera.centre_mm, SURFACES, TRANSMISSION, top_mm,
+        scene.optical_mm, scene.front_mm, scene.material, shape.grid, spans, kinds,
+        shape.head, camera.centre_mm, SURFACES, TRANSMISSION, shape.top_mm,
     )  # fmt: skip
-    return spans, images(camera.packed, spans), brightness
+    return spans, kinds, images(camera.packed, spans, truth.stripe_sigma_px), brightness
+
+
+def _astray(
+    scene: Scene, truth: OpticalTruth, side: Side, shape: _Shape, spans: NDArray[np.float64], kinds: NDArray[np.int64]
+) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Images (n, 4) and brightness (n,) of glint and of second stripes."""
+    flaws, camera = truth.flaws, truth.camera(side)
+    field = (scene.optical_mm, scene.front_mm, scene.material, shape.grid)
+    rays = (shape.head, camera.centre_mm)
+    found: list[tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]] = []
+    if flaws.glint > 0 or flaws.glass_haze > 0:
+        glass = np.array([flaws.glass_haze, flaws.glint * GLASS_MIRROR[0], GLASS_MIRROR[1]])
+        edges = flaws.glint * WORN_EDGES
+        found.append(glints(*field, shape.plane, *rays, edges, glass, shape.line_mm, shape.top_mm))
+    if flaws.secondary > 0 or flaws.sheen > 0:
+        albedo = SURFACES[:, 0]
+        walls = np.stack([albedo, albedo * flaws.secondary * SCENE_ALBEDO, MIRRORS * flaws.sheen], axis=1)
+        found.append(second_stripes(*field, spans, kinds, *rays, walls, shape.line_mm, shape.top_mm))
+    return [_spread(truth, side, *stray) for stray in found]
+
+
+def _spread(
+    truth: OpticalTruth,
+    side: Side,
+    spans: NDArray[np.float64],
+    brightness: NDArray[np.float64],
+    width_mm: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Images (n, 4) of spans of their own width, and the brightness at which `splat` gives them the right crest."""
+    camera, line_px = truth.camera(side), truth.stripe_sigma_px
+    pieces = images(camera.packed, spans, LENS_SIGMA_PX)
+    width_px = width_mm * float(camera.matrix[0, 0]) / SHARP_AT_MM
+    pieces[:, 3] = np.hypot(pieces[:, 3], width_px)
+    return pieces, brightness * width_px / line_px
 
 
 def true_stripe(scene: Scene, truth: OpticalTruth, side: Side, x_mm: float) -> StripeTruth:
@@ -95,6 +165,15 @@ def stripe_light(
     return image, touched
 
 
+def sensor_of(truth: OpticalTruth, side: Side, exposure_s: float) -> Sensor:
+    """What a camera's sensor adds to an exposure."""
+    camera, flaws = truth.camera(side), truth.flaws
+    # Cameras of one build differ by less than a step in grain, and share the tile.
+    tile = speckle_tile(round(camera.grain_px, 1), flaws.speckle_looks) if flaws.speckle_looks > 0 else None
+    hot = camera.hot * np.array([1.0, 1.0, exposure_s])
+    return Sensor(tile, flaws.blooming, flaws.full_well_dn, hot)
+
+
 def render_stripe(
     scene: Scene,
     truth: OpticalTruth,
@@ -110,14 +189,23 @@ def render_stripe(
     -----
     The laser plane is cut with the surface that light meets (below glass: what lies behind it), walls included.
     Each piece is marched towards the laser's head (shadow) and towards the camera (occlusion), projected with
-    distortion and drawn with a Gaussian cross section. Glass weakens the beam on each way; black returns nothing.
-    Secondary reflections and the glass's own glint are left out.
+    distortion and drawn with a Gaussian cross section that widens out of focus. Glass weakens the beam on each way;
+    black returns nothing. Glint and second stripes are drawn over it, see `stray_kernels`; room and lamp light the
+    scene as if it were a flat grey card. Left out: refraction in glass, and light that is scattered more than once.
     """
     camera = truth.camera(side)
+    sensor = sensor_of(truth, side, exposure_s)
+    ambient_dn = SCENE_ALBEDO * truth.flaws.ambient_dn_per_s * exposure_s
+    slope_dn = (ambient_dn * truth.flaws.ambient_gradient[0], ambient_dn * truth.flaws.ambient_gradient[1])
     if laser_on:
-        _, pieces, brightness = _pieces(scene, truth, side, x_mm)
-        laser, touched = stripe_light(pieces, brightness * (STRIPE_DN_PER_S * exposure_s), truth, side)
-        return expose(rng, SCENE_ALBEDO * AMBIENT_DN_PER_S * exposure_s, laser, touched)
+        shape = _shape(scene, truth, side, x_mm)
+        spans, kinds, pieces, brightness = _direct(scene, truth, side, shape)
+        crest_dn = STRIPE_DN_PER_S * exposure_s
+        laser, touched = stripe_light(pieces, brightness * crest_dn, truth, side)
+        for stray, shine in _astray(scene, truth, side, shape, spans, kinds):
+            splat(stray, shine * crest_dn, truth.stripe_sigma_px, laser, touched)
+        return expose(rng, ambient_dn, laser, touched, sensor, slope_dn)
     dark = np.zeros((camera.height_px, camera.width_px), dtype=np.float32)
     nothing = np.zeros((camera.height_px, 2), dtype=np.int64)
-    return expose(rng, SCENE_ALBEDO * (AMBIENT_DN_PER_S + LAMP_DN_PER_S) * exposure_s, dark, nothing)
+    lamp_dn = SCENE_ALBEDO * LAMP_DN_PER_S * exposure_s
+    return expose(rng, ambient_dn + lamp_dn, dark, nothing, sensor, slope_dn)

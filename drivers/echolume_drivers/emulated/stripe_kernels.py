@@ -17,12 +17,12 @@ TOP, WALL = 0, 1
 
 
 @numba.njit(cache=True, nogil=True)
-def _cell(value: float, origin_mm: float, cell_mm: float) -> int:
+def cell_of(value: float, origin_mm: float, cell_mm: float) -> int:
     return math.floor((value - origin_mm) / cell_mm)
 
 
 @numba.njit(cache=True, nogil=True)
-def _height(field: Floats, ix: int, iy: int) -> float:
+def height_at(field: Floats, ix: int, iy: int) -> float:
     """Height of a cell; the bench (0) goes on beyond the field."""
     if ix < 0 or iy < 0 or iy >= field.shape[0] or ix >= field.shape[1]:
         return 0.0
@@ -45,7 +45,7 @@ def trace(
     """
     x0, y0, cell = grid[0], grid[1], grid[2]
     dx, dy, dz = target[0] - start[0], target[1] - start[1], target[2] - start[2]
-    ix, iy = _cell(start[0], x0, cell), _cell(start[1], y0, cell)
+    ix, iy = cell_of(start[0], x0, cell), cell_of(start[1], y0, cell)
     step_x, step_y = (1 if dx > 0 else -1), (1 if dy > 0 else -1)
     next_x = x0 + (ix + (1 if dx > 0 else 0)) * cell
     next_y = y0 + (iy + (1 if dy > 0 else 0)) * cell
@@ -58,7 +58,7 @@ def trace(
         z = start[2] + t * dz
         if z > top_mm:
             break
-        if z < _height(optical, ix, iy) - 1e-6:
+        if z < height_at(optical, ix, iy) - 1e-6:
             return -1
         in_field = 0 <= ix < optical.shape[1] and 0 <= iy < optical.shape[0]
         in_glass = in_field and material[iy, ix] == GLASS and z < front[iy, ix]
@@ -93,17 +93,17 @@ def project(camera: Floats, x: float, y: float, z: float) -> tuple[float, float]
 
 
 @numba.njit(cache=True, nogil=True)
-def _top_height(optical: Floats, grid: Floats, plane: Floats, y: float, iy: int) -> float:
+def top_height(optical: Floats, grid: Floats, plane: Floats, y: float, iy: int) -> float:
     """Where the laser plane, coming from above at this y, meets the cells of row iy."""
     x_low = (plane[3] - plane[1] * y) / plane[0]
-    first = _height(optical, _cell(x_low, grid[0], grid[2]), iy)
+    first = height_at(optical, cell_of(x_low, grid[0], grid[2]), iy)
     x_first = x_low - plane[2] / plane[0] * first
-    ix = _cell(x_first, grid[0], grid[2])
-    second = _height(optical, ix, iy)
+    ix = cell_of(x_first, grid[0], grid[2])
+    second = height_at(optical, ix, iy)
     if second == first:
         return first
     x_second = x_low - plane[2] / plane[0] * second
-    if _cell(x_second, grid[0], grid[2]) == ix:
+    if cell_of(x_second, grid[0], grid[2]) == ix:
         return second
     # The plane leaves the cell on the way down: it meets the side of its higher neighbour.
     edge = grid[0] + (ix + (1 if x_second > x_first else 0)) * grid[2]
@@ -137,7 +137,7 @@ def cut(
     kinds
         Shape (n, 3): TOP or WALL, the wall's outward direction along y (-1 or 1), the material.
     """
-    first, last = _cell(y_mm[0], grid[1], grid[2]), _cell(y_mm[1], grid[1], grid[2])
+    first, last = cell_of(y_mm[0], grid[1], grid[2]), cell_of(y_mm[1], grid[1], grid[2])
     per_cell = max(1, round(per_mm * grid[2]))
     limit = (last - first + 1) * (per_cell + 2 + int(per_mm * (relief_mm + 1)))
     spans = np.empty((limit, 6))
@@ -147,16 +147,16 @@ def cut(
         y_start = grid[1] + iy * grid[2]
         for k in range(per_cell):
             ya, yb = y_start + k * grid[2] / per_cell, y_start + (k + 1) * grid[2] / per_cell
-            za, zb = _top_height(optical, grid, plane, ya, iy), _top_height(optical, grid, plane, yb, iy)
+            za, zb = top_height(optical, grid, plane, ya, iy), top_height(optical, grid, plane, yb, iy)
             xa = (plane[3] - plane[1] * ya - plane[2] * za) / plane[0]
             xb = (plane[3] - plane[1] * yb - plane[2] * zb) / plane[0]
-            ix = _cell(0.5 * (xa + xb), grid[0], grid[2])
+            ix = cell_of(0.5 * (xa + xb), grid[0], grid[2])
             _put(spans, n, xa, ya, za, xb, yb, zb)
             kinds[n, 0], kinds[n, 1] = TOP, 0
-            kinds[n, 2] = _material(material, ix, iy)
+            kinds[n, 2] = material_at(material, ix, iy)
             n += 1
         y_end = y_start + grid[2]
-        z_here, z_next = _top_height(optical, grid, plane, y_end, iy), _top_height(optical, grid, plane, y_end, iy + 1)
+        z_here, z_next = top_height(optical, grid, plane, y_end, iy), top_height(optical, grid, plane, y_end, iy + 1)
         rise = z_next - z_here
         if abs(rise) < 1e-9:
             continue
@@ -168,13 +168,13 @@ def cut(
             xb = (plane[3] - plane[1] * y_end - plane[2] * zb) / plane[0]
             _put(spans, n, xa, y_end, za, xb, y_end, zb)
             kinds[n, 0], kinds[n, 1] = WALL, (-1 if rise > 0 else 1)
-            kinds[n, 2] = _material(material, _cell(0.5 * (xa + xb), grid[0], grid[2]), owner)
+            kinds[n, 2] = material_at(material, cell_of(0.5 * (xa + xb), grid[0], grid[2]), owner)
             n += 1
     return spans[:n], kinds[:n]
 
 
 @numba.njit(cache=True, nogil=True)
-def _material(material: NDArray[np.uint8], ix: int, iy: int) -> int:
+def material_at(material: NDArray[np.uint8], ix: int, iy: int) -> int:
     if ix < 0 or iy < 0 or iy >= material.shape[0] or ix >= material.shape[1]:
         return 0
     return int(material[iy, ix])
@@ -232,41 +232,50 @@ def light(
 
 
 @numba.njit(cache=True, nogil=True)
-def images(camera: Floats, spans: Floats) -> Floats:
-    """Image of each piece, shape (n, 3): its middle u, v and its length, all in px."""
-    out = np.empty((spans.shape[0], 3))
+def images(camera: Floats, spans: Floats, width_px: float) -> Floats:
+    """Image of each piece of a line `width_px` wide, shape (n, 4): middle u, v, length, and width with defocus, px.
+
+    Widths are standard deviations; `camera` is CameraTruth.packed.
+    """
+    out = np.empty((spans.shape[0], 4))
     for i in range(spans.shape[0]):
         ua, va = project(camera, spans[i, 0], spans[i, 1], spans[i, 2])
         ub, vb = project(camera, spans[i, 3], spans[i, 4], spans[i, 5])
         out[i, 0], out[i, 1] = 0.5 * (ua + ub), 0.5 * (va + vb)
         out[i, 2] = math.sqrt((ub - ua) ** 2 + (vb - va) ** 2)
+        far_mm = camera[17] * spans[i, 0] + camera[18] * spans[i, 1] + camera[19] * spans[i, 2] + camera[20]
+        blur_px = camera[21] * (1.0 - camera[22] / far_mm)
+        out[i, 3] = math.sqrt(width_px**2 + blur_px**2)
     return out
 
 
 @numba.njit(cache=True, nogil=True)
 def splat(
-    pieces: Floats, brightness: Floats, sigma_px: float, image: NDArray[np.float32], touched: NDArray[np.int64]
+    pieces: Floats, brightness: Floats, width_px: float, image: NDArray[np.float32], touched: NDArray[np.int64]
 ) -> None:
-    """Add a line of Gaussian cross section to `image` (rows, columns); its crest is `brightness`.
+    """Add a line of Gaussian cross section to `image` (rows, columns).
 
-    `touched` (rows, 2) gets the first column and the one after the last that are not dark, per row.
+    `pieces` (n, 4) are `images`; where their width is `width_px`, the line's crest is `brightness`, and wider pieces
+    spread the same light. `touched` (rows, 2) gets the first column and the one after the last that are not dark.
     """
     rows, columns = image.shape
-    half = math.ceil(4.5 * sigma_px)
-    across = np.empty(2 * half + 1)
-    down = np.empty(2 * half + 1)
-    scale = 1.0 / (sigma_px * math.sqrt(2 * math.pi))
+    reach = 0.0
+    for i in range(pieces.shape[0]):
+        reach = max(reach, pieces[i, 3])
+    room = 2 * math.ceil(4.5 * reach) + 1
+    across, down = np.empty(room), np.empty(room)
     for i in range(pieces.shape[0]):
         if brightness[i] <= 0.0:
             continue
-        u, v = pieces[i, 0], pieces[i, 1]
+        u, v, sigma_px = pieces[i, 0], pieces[i, 1], pieces[i, 3]
+        half = math.ceil(4.5 * sigma_px)
         c, r = round(u), round(v)
         if c + half < 0 or r + half < 0 or c - half >= columns or r - half >= rows:
             continue
         for k in range(-half, half + 1):
             across[k + half] = math.exp(-0.5 * ((c + k - u) / sigma_px) ** 2)
             down[k + half] = math.exp(-0.5 * ((r + k - v) / sigma_px) ** 2)
-        weight = brightness[i] * pieces[i, 2] * scale
+        weight = brightness[i] * pieces[i, 2] * width_px / (sigma_px * sigma_px * math.sqrt(2 * math.pi))
         lo, hi = max(0, c - half), min(columns, c + half + 1)
         for row in range(max(0, r - half), min(rows, r + half + 1)):
             gain = np.float32(weight * down[row - r + half])

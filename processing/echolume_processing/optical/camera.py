@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from echolume_messages import geometry
 from echolume_messages.calibration import CameraCalibration
 from echolume_messages.geometry import Matrix, Points3, require_shape
-from echolume_processing.optical.lens import undistort_points
+from echolume_processing.optical import lens
 
 Points2 = NDArray[np.float64]
 
@@ -57,9 +57,10 @@ class Camera:
     def undistort(self, points_px: Points2) -> Points2:
         """Undistorted pixel coordinates (n, 2) of image points (n, 2); nan stays nan."""
         require_shape("points_px", points_px, (None, 2))
-        out = np.empty(points_px.shape, dtype=np.float64)
-        undistort_points(np.ascontiguousarray(points_px, dtype=np.float64), self.lens, out)
-        return out
+        u, v = (np.ascontiguousarray(points_px[:, axis], dtype=np.float64) for axis in (0, 1))
+        out = np.empty((2, len(u)))
+        lens.undistort(u, v, self.lens, out[0], out[1])
+        return np.ascontiguousarray(out.T)
 
     def rays(self, points_px: Points2) -> Points3:
         """Directions (n, 3) in the rig frame, depth 1, of undistorted points (n, 2)."""

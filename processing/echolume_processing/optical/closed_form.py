@@ -14,7 +14,7 @@ BLOCK = 256
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def _stereo_block(m: Matrix, w: Matrix, px: NDArray[np.float64], count: int, out: NDArray[np.float64]) -> None:
+def stereo_block(m: Matrix, w: Matrix, px: NDArray[np.float64], count: int, out: NDArray[np.float64]) -> None:
     """Points (3, count) of image points (4, count); one value a line, so that the compiler takes several at once."""
     for i in range(count):
         ul, vl, ur, vr = px[0, i], px[1, i], px[2, i], px[3, i]
@@ -55,7 +55,7 @@ def stereo_points(left: Matrix, right: Matrix, left_px: Points, right_px: Points
         for i in range(count):
             px[0, i], px[1, i] = left_px[start + i, 0], left_px[start + i, 1]
             px[2, i], px[3, i] = right_px[start + i, 0], right_px[start + i, 1]
-        _stereo_block(left, right, px, count, xyz)
+        stereo_block(left, right, px, count, xyz)
         for i in range(count):
             out[start + i, 0], out[start + i, 1], out[start + i, 2] = xyz[0, i], xyz[1, i], xyz[2, i]
 

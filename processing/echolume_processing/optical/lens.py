@@ -1,4 +1,4 @@
-"""Compiled lens distortion, one image point at a time."""
+"""Compiled lens distortion: image points to undistorted ones by Newton's method."""
 
 from __future__ import annotations
 
@@ -6,47 +6,58 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-MAX_ITERATIONS = 20
+Values = NDArray[np.float64]
+
+STEPS = 3
+"""Newton steps that every point takes; those that are not done by then go on one by one."""
+MORE_STEPS = 20
+DONE = 1e-6
+"""Length of a step, of normalised coordinates, after which the next would be its square."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def undistort_point(u: float, v: float, lens: NDArray[np.float64]) -> tuple[float, float]:
-    """Undistorted pixel coordinates of an image point, by Newton's method; `lens` is `Camera.lens`."""
-    fx, skew, cx, fy, cy = lens[0], lens[1], lens[2], lens[3], lens[4]
-    k1, k2, p1, p2, k3 = lens[5], lens[6], lens[7], lens[8], lens[9]
-    y0 = (v - cy) / fy
-    x0 = (u - cx - skew * y0) / fx
-    x, y = x0, y0
-    for _ in range(MAX_ITERATIONS):
-        r2 = x * x + y * y
-        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))
-        off_x = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x) - x0
-        off_y = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y - y0
-        a = radial + x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
-        b = x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y
-        d = radial + y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x
-        scale = 1.0 / (a * d - b * b)
-        step_x, step_y = (d * off_x - b * off_y) * scale, (a * off_y - b * off_x) * scale
-        x -= step_x
-        y -= step_y
-        if not abs(step_x) + abs(step_y) > 1e-6:  # the next step would be its square
-            break
-    return fx * x + skew * y + cx, fy * y + cy
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def distorted_row(u: float, v: float, lens: NDArray[np.float64]) -> float:
-    """Image row at which the camera shows an undistorted point."""
-    y = (v - lens[4]) / lens[3]
-    x = (u - lens[2] - lens[1] * y) / lens[0]
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _step(x: float, y: float, x0: float, y0: float, k: Values) -> tuple[float, float]:
+    """Newton's step from (x, y) towards the point that the lens moves to (x0, y0); k is k1, k2, p1, p2, k3."""
+    k1, k2, p1, p2, k3 = k[5], k[6], k[7], k[8], k[9]
     r2 = x * x + y * y
-    radial = 1.0 + r2 * (lens[5] + r2 * (lens[6] + r2 * lens[9]))
-    return lens[3] * (y * radial + lens[7] * (r2 + 2.0 * y * y) + 2.0 * lens[8] * x * y) + lens[4]
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))
+    off_x = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x) - x0
+    off_y = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y - y0
+    a = radial + x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
+    b = x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y
+    d = radial + y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x
+    scale = 1.0 / (a * d - b * b)
+    return (d * off_x - b * off_y) * scale, (a * off_y - b * off_x) * scale
 
 
-@njit(cache=True, nogil=True)
-def undistort_points(points: NDArray[np.float64], lens: NDArray[np.float64], out: NDArray[np.float64]) -> None:
-    """Fill `out` (n, 2) with the undistorted image points of `points` (n, 2)."""
-    for i in range(points.shape[0]):
-        out[i, 0], out[i, 1] = undistort_point(points[i, 0], points[i, 1], lens)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def undistort(u: Values, v: Values, lens: Values, out_u: Values, out_v: Values) -> None:
+    """Fill `out_u`, `out_v` (n,) with the undistorted points of image points `u`, `v` (n,); see `Camera.lens`."""
+    fx, skew, cx, fy, cy = lens[0], lens[1], lens[2], lens[3], lens[4]
+    moved = np.empty(len(u))
+    # No branch in this loop: the compiler takes several points at once.
+    for i in range(len(u)):
+        y0 = (v[i] - cy) / fy
+        x0 = (u[i] - cx - skew * y0) / fx
+        x, y = x0, y0
+        step_x, step_y = 0.0, 0.0
+        for _ in range(STEPS):
+            step_x, step_y = _step(x, y, x0, y0, lens)
+            x -= step_x
+            y -= step_y
+        out_u[i], out_v[i], moved[i] = x, y, abs(step_x) + abs(step_y)
+    for i in range(len(u)):
+        if moved[i] > DONE:
+            y0 = (v[i] - cy) / fy
+            x0 = (u[i] - cx - skew * y0) / fx
+            for _ in range(MORE_STEPS):
+                step_x, step_y = _step(out_u[i], out_v[i], x0, y0, lens)
+                out_u[i] -= step_x
+                out_v[i] -= step_y
+                if not abs(step_x) + abs(step_y) > DONE:
+                    break
+    for i in range(len(u)):
+        x, y = out_u[i], out_v[i]
+        out_u[i] = fx * x + skew * y + cx
+        out_v[i] = fy * y + cy

@@ -9,13 +9,18 @@ from numpy.typing import NDArray
 
 from echolume_messages.calibration import Calibration, CameraCalibration, LaserCalibration
 from echolume_messages.types import OPTICAL_POINT, Frame, OpticalSource, Structured
-from echolume_processing.optical import correspond, select, stripe, triangulate
+from echolume_processing.optical import agreement, correspond, covariance, select, stripe, triangulate
+from echolume_processing.optical.agreement import Agreement
 from echolume_processing.optical.camera import Camera
-from echolume_processing.optical.correspond import Side
-from echolume_processing.optical.stripe import Stripe
+from echolume_processing.optical.candidates import Candidates, View, candidates_of
+from echolume_processing.optical.correspond import Match
+from echolume_processing.optical.select import Verdict
 
-STEP_PX = 0.05
-"""Step of the numerical derivatives of z."""
+Values = NDArray[np.float64]
+
+FEW_BENDS = 30
+SATURATED, BOTH = 1, 2
+"""Bits of a point's flags."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +33,10 @@ class OpticalSettings:
         Where a point may lie; beyond it is a reflection or clutter.
     plane_sigma_mm : float
         How well the laser plane's position is known at each stripe (calibration and guide).
+    camera_sigma : float
+        Error of the camera model over the RMS of its calibration: the root of parameters over observations.
+    least_camera_px : float
+        No camera model is better than this.
     run_rows : int
         A candidate without the other camera's support needs this many neighbouring rows that agree.
     """
@@ -35,15 +44,48 @@ class OpticalSettings:
     z_mm: tuple[float, float] = (-8.0, 80.0)
     y_mm: tuple[float, float] = (-130.0, 130.0)
     plane_sigma_mm: float = 0.02
+    camera_sigma: float = 0.25
+    least_camera_px: float = 0.005
     run_rows: int = 6
 
 
 @dataclass(frozen=True)
-class _View:
-    camera: Camera
-    projection: NDArray[np.float64]
-    centre_mm: NDArray[np.float64]
-    f_to_other: NDArray[np.float64]
+class StripePoints:
+    """All that one camera pair yields.
+
+    Attributes
+    ----------
+    points : (n,) OPTICAL_POINT
+        Stereo points, then active left, then active right; each in order of the image rows.
+    covariance : (6, n) float64
+        Of each point: xx, xy, xz, yy, yz, zz in mm^2; `matrices` gives them as (n, 3, 3).
+    joint_mm, joint_covariance : (3, m), (6, m) float64
+        Stereo points with the laser plane as one more measurement, in the order of the stereo points.
+    verdicts : two of (8,) int64
+        How many candidates of the left and of the right camera met each `Verdict`.
+    agreement : Agreement
+        Of both cameras' heights.
+    """
+
+    points: Structured
+    covariance: Values
+    joint_mm: Values
+    joint_covariance: Values
+    verdicts: tuple[NDArray[np.int64], NDArray[np.int64]]
+    agreement: Agreement
+
+    @property
+    def matrices(self) -> NDArray[np.float64]:
+        """Covariance of each point, (n, 3, 3) in mm^2."""
+        return covariance.full(self.covariance)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Points by label (both, left only, right only) and rejected candidates by reason."""
+        left, right = self.verdicts
+        labels = {"both": int(left[Verdict.BOTH]), "left": int(left[Verdict.ALONE]), "right": int(right[Verdict.ALONE])}
+        reasons = {v.name.lower(): int(left[v] + right[v]) for v in Verdict if v >= Verdict.OUTSIDE}
+        return {**labels, **reasons}
 
 
 class OpticalPipeline:
@@ -82,9 +124,10 @@ class OpticalPipeline:
     ) -> None:
         self._settings = settings or OpticalSettings()
         cameras = Camera.of(left), Camera.of(right)
-        m = cameras[0].projection, cameras[1].projection
-        self._left = _View(cameras[0], m[0], cameras[0].centre_mm, triangulate.fundamental(m[0], m[1]))
-        self._right = _View(cameras[1], m[1], cameras[1].centre_mm, triangulate.fundamental(m[1], m[0]))
+        self._views = View.of(cameras[0], cameras[1]), View.of(cameras[1], cameras[0])
+        used = self._settings
+        self._camera_px = tuple(max(used.camera_sigma * c.rms_px, used.least_camera_px) for c in (left, right))
+        self._gates_mm = np.array([*used.z_mm, *used.y_mm])
         self._normal = np.asarray(laser.normal, dtype=np.float64)
         self._offset_mm = laser.offset_mm
         self._per_guide_mm = float(self._normal @ np.asarray(laser.guide_direction, dtype=np.float64))
@@ -136,131 +179,127 @@ class OpticalPipeline:
         ValueError
             If a frame is not of the calibrated camera's size.
 
+        References
+        ----------
+        Llata et al., 2.2, eq. 1-4.
+        """
+        return self.measure(left, right, x_mm).points
+
+    def measure(self, left: Frame, right: Frame, x_mm: float) -> StripePoints:
+        """Points of one stripe with their covariances, and what became of all candidates; see `process`.
+
         Notes
         -----
         A pair of candidates whose active points predict each other is believed. Without such support a candidate
         is kept only if neither camera sees a believed stripe on the same row, and its neighbours agree.
-
-        References
-        ----------
-        Llata et al., 2.2, eq. 1-4.
         """
         for name, frame, size in (("left", left, self._sizes[0]), ("right", right, self._sizes[1])):
             if frame.shape != size:
                 raise ValueError(f"{name} frame: expected shape {size} of the calibration, got {frame.shape}")
         distance_mm = self._offset_mm + x_mm * self._per_guide_mm
-        stripes = stripe.extract(left), stripe.extract(right)
-        views = self._left, self._right
-        sides = tuple(self._active(view, s, distance_mm) for view, s in zip(views, stripes, strict=True))
-        rows_in_other = tuple(
-            _rows(views[1 - i].camera, sides[i].active_mm, self._sizes[1 - i][0]) for i in (0, 1)
-        )  # each (rows, k)
-        matches = tuple(
-            correspond.walk(sides[i], sides[1 - i], views[1 - i].projection, rows_in_other[i], views[i].f_to_other)
-            for i in (0, 1)
+        views = self._views
+        sides = tuple(
+            candidates_of(
+                stripe.extract(frame), views[i], views[1 - i], self._normal, distance_mm, self._gates_mm
+            )
+            for i, frame in enumerate((left, right))
+        )  # fmt: skip
+        matches = tuple(correspond.walk(sides[i], sides[1 - i], views[i].f_to_other) for i in (0, 1))
+        verdicts = select.choose(sides, matches, self._settings.run_rows)
+        sigmas = tuple(_with_speckle(side, verdict) for side, verdict in zip(sides, verdicts, strict=True))
+        pair = self._pair(sides, matches[0], verdicts, sigmas, distance_mm)
+        alone = [self._active(i, sides[i], verdicts[i], sigmas[i]) for i in (0, 1)]
+        return StripePoints(
+            _pack([pair.set, *alone]),
+            np.concatenate([pair.set.covariance, *(s.covariance for s in alone)], axis=1),
+            pair.joint_mm,
+            pair.joint_covariance,
+            tuple(np.bincount(v, minlength=len(Verdict)) for v in verdicts),
+            pair.agreement,
         )
-        kept = select.choose(
-            (sides[0].active_mm[..., 2], sides[1].active_mm[..., 2]),
-            (stripes[0].amplitude_dn, stripes[1].amplitude_dn),
-            (stripes[0].width_px, stripes[1].width_px),
-            (matches[0][0], matches[1][0]),
-            rows_in_other,
-            self._settings.run_rows,
-        )
-        sigmas = tuple(_column_sigma(s, chosen) for s, chosen in zip(stripes, kept, strict=True))
-        parts = [self._stereo(stripes, sides, matches[0], kept[0], sigmas)]
-        for i, source in enumerate((OpticalSource.ACTIVE_LEFT, OpticalSource.ACTIVE_RIGHT)):
-            parts.append(self._active_set(views[i], stripes[i], sides[i], kept[i], sigmas[i], distance_mm, source))
-        return np.concatenate(parts)
 
-    def _active(self, view: _View, found: Stripe, distance_mm: float) -> Side:
-        rows, k = found.column_px.shape
-        image = np.stack([found.column_px, np.broadcast_to(np.arange(rows)[:, None], (rows, k))], axis=-1)
-        points_px = view.camera.undistort(image.reshape(-1, 2))  # (rows * k, 2)
-        points = triangulate.active_plane(view.centre_mm, view.camera.rays(points_px), self._normal, distance_mm)
-        gate = self._settings
-        inside = (points[:, 2] > gate.z_mm[0]) & (points[:, 2] < gate.z_mm[1])
-        inside &= (points[:, 1] > gate.y_mm[0]) & (points[:, 1] < gate.y_mm[1])
-        points[~inside] = np.nan
-        return Side(points_px.reshape(rows, k, 2), points.reshape(rows, k, 3))
-
-    def _stereo(
+    def _pair(
         self,
-        stripes: tuple[Stripe, Stripe],
-        sides: tuple[Side, ...],
-        match: tuple[NDArray[np.int64], NDArray[np.float64]],
-        kept: NDArray[np.bool_],
-        sigmas: tuple[NDArray[np.float64], ...],
-    ) -> Structured:
-        partner, match_px = match
-        row, k = np.nonzero(kept & (partner >= 0))
-        left_px, right_px = sides[0].points_px[row, k], match_px[row, k]  # (n, 2)
-        other = np.unravel_index(partner[row, k], stripes[1].column_px.shape)
-        m = self._left.projection, self._right.projection
-        points = triangulate.stereo(*m, left_px, right_px)
-        step = np.array([STEP_PX, 0.0])
-        by_left = (triangulate.stereo(*m, left_px + step, right_px)[:, 2] - points[:, 2]) / STEP_PX
-        by_right = (triangulate.stereo(*m, left_px, right_px + step)[:, 2] - points[:, 2]) / STEP_PX
-        sigma_mm = np.hypot(by_left * sigmas[0][row, k], by_right * sigmas[1][other])
-        saturated = stripes[0].saturated[row, k] | stripes[1].saturated[other]
-        good = self._inside(points)
-        return _pack(points, sigma_mm, saturated, row, OpticalSource.STEREO)[good]
-
-    def _inside(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        low, high = self._settings.z_mm
-        return (points[:, 2] > low) & (points[:, 2] < high)
-
-    def _active_set(
-        self,
-        view: _View,
-        found: Stripe,
-        side: Side,
-        kept: NDArray[np.bool_],
-        sigma_px: NDArray[np.float64],
+        sides: tuple[Candidates, ...],
+        match: Match,
+        verdicts: tuple[select.Verdicts, ...],
+        sigmas: tuple[Values, ...],
         distance_mm: float,
-        source: OpticalSource,
-    ) -> Structured:
-        row, k = np.nonzero(kept)
-        points = side.active_mm[row, k]
-        moved = side.points_px[row, k] + np.array([STEP_PX, 0.0])
-        aside = triangulate.active_plane(view.centre_mm, view.camera.rays(moved), self._normal, distance_mm)
-        by_column = (aside[:, 2] - points[:, 2]) / STEP_PX
-        rays = points - view.centre_mm
-        by_plane = rays[:, 2] / (rays @ self._normal)
-        sigma_mm = np.hypot(by_column * sigma_px[row, k], by_plane * self._settings.plane_sigma_mm)
-        return _pack(points, sigma_mm, found.saturated[row, k], row, source)
+    ) -> _Pair:
+        """Everything that rests on both cameras."""
+        left, right = self._views
+        both = np.flatnonzero(verdicts[0] == Verdict.BOTH)
+        both = both[verdicts[1][match.partner[both]] == Verdict.BOTH]
+        other = match.partner[both]
+        seen = np.concatenate([sides[0].points_px[:, both], match.points_px[:, both]])  # (4, n)
+        points = triangulate.stereo_columns(left.projection, right.projection, seen)
+        sigma_left = np.hypot(sigmas[0][both], self._camera_px[0])
+        sigma_right = np.sqrt(match.gain[both] * sigmas[1][other] ** 2 + self._camera_px[1] ** 2)
+        found = covariance.stereo_covariance(
+            left.projection, right.projection, points, sigma_left, sigma_right, self._camera_px[0]
+        )
+        drawn = covariance.joint(points, found, self._normal, distance_mm, self._settings.plane_sigma_mm)
+        clipped = sides[0].saturated[both] | sides[1].saturated[other]
+        flags = clipped * np.uint8(SATURATED) | np.uint8(BOTH)
+        plane = triangulate.plane_from_pixel(right.centre_mm, right.ray_matrix, self._normal, distance_mm)
+        active_mm = sides[0].active_mm[:, both]
+        difference_mm = active_mm[2] - triangulate.active(plane, np.ascontiguousarray(seen[2:].T))[:, 2]
+        by_mm = agreement.plane_amplification(active_mm.T, left.centre_mm, right.centre_mm, self._normal)
+        chosen = _Set(points, found, flags, sides[0].row[both], OpticalSource.STEREO)
+        return _Pair(chosen, *drawn, agreement.of_stripe(difference_mm, by_mm))
+
+    def _active(self, i: int, side: Candidates, verdict: select.Verdicts, sigma_px: Values) -> _Set:
+        """The active points of one camera."""
+        kept = np.flatnonzero(verdict <= Verdict.ALONE)
+        points = side.active_mm[:, kept]
+        column_px = np.hypot(sigma_px[kept], self._camera_px[i])
+        found = covariance.active_covariance(
+            self._views[i].projection, self._normal, points, column_px, self._camera_px[i],
+            self._settings.plane_sigma_mm,
+        )  # fmt: skip
+        flags = side.saturated[kept] * np.uint8(SATURATED) | (verdict[kept] == Verdict.BOTH) * np.uint8(BOTH)
+        source = OpticalSource.ACTIVE_RIGHT if i else OpticalSource.ACTIVE_LEFT
+        return _Set(points, found, flags, side.row[kept], source)
 
 
-def _rows(camera: Camera, points: NDArray[np.float64], height_px: int) -> NDArray[np.float64]:
-    """Image row (rows, k) at which a camera sees points (rows, k, 3); nan outside its image."""
-    v = camera.project(points.reshape(-1, 3))[:, 1].reshape(points.shape[:2])
-    return np.where((v >= 0) & (v <= height_px - 1), v, np.nan)
+@dataclass(frozen=True)
+class _Set:
+    points_mm: Values
+    covariance: Values
+    flags: NDArray[np.uint8]
+    row: NDArray[np.int64]
+    source: OpticalSource
 
 
-def _column_sigma(found: Stripe, kept: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Sigma of each column in pixels, (rows, k): the noise bound, and the speckle that the stripe itself shows."""
-    bound = found.sigma_px
-    column = np.where(kept, found.column_px, np.nan)[:, 0]
-    bend = column[2:] - 2 * column[1:-1] + column[:-2]
+@dataclass(frozen=True)
+class _Pair:
+    set: _Set
+    joint_mm: Values
+    joint_covariance: Values
+    agreement: Agreement
+
+
+def _with_speckle(side: Candidates, verdict: select.Verdicts) -> Values:
+    """Sigma of each column in pixels, (n,): as the extraction states it, and what the stripe itself shows on top."""
+    agreed = verdict == Verdict.BOTH
+    column = np.full(side.rows, np.nan)
+    column[side.row[agreed]] = side.measured[0, agreed]
+    lag = agreement.LAG_ROWS
+    bend = column[2 * lag :] - 2 * column[lag:-lag] + column[: -2 * lag]
     bend = bend[np.isfinite(bend)]
-    if len(bend) < 30:
-        return bound
-    seen = 1.4826 * float(np.median(np.abs(bend))) / np.sqrt(6.0)
-    extra = max(seen**2 - float(np.nanmedian(np.where(kept, bound, np.nan) ** 2)), 0.0)
-    return np.sqrt(bound**2 + extra)
+    if len(bend) < FEW_BENDS:
+        return side.sigma_px
+    seen_px = 1.4826 * float(np.median(np.abs(bend))) / np.sqrt(6.0)
+    extra = max(seen_px**2 - float(np.median(side.sigma_px[agreed])) ** 2, 0.0)
+    return np.sqrt(side.sigma_px**2 + extra)
 
 
-def _pack(
-    points: NDArray[np.float64],
-    sigma_mm: NDArray[np.float64],
-    saturated: NDArray[np.bool_],
-    row: NDArray[np.int64],
-    source: OpticalSource,
-) -> Structured:
-    out = np.zeros(len(points), dtype=OPTICAL_POINT)
-    out["x_mm"], out["y_mm"], out["z_mm"] = points.T
-    out["sigma_z_mm"] = sigma_mm
-    out["source"] = source
-    out["flags"] = saturated
-    out["row"] = row
+def _pack(sets: list[_Set]) -> Structured:
+    points = np.concatenate([s.points_mm for s in sets], axis=1)
+    out = np.empty(points.shape[1], dtype=OPTICAL_POINT)
+    out["x_mm"], out["y_mm"], out["z_mm"] = points
+    out["sigma_z_mm"] = np.sqrt(np.concatenate([s.covariance[5] for s in sets]))
+    out["flags"] = np.concatenate([s.flags for s in sets])
+    out["row"] = np.concatenate([s.row for s in sets])
+    out["source"] = np.repeat([s.source for s in sets], [len(s.row) for s in sets])
     return out

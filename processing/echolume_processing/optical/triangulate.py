@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echolume_messages.geometry import Matrix, Points3, require_shape
-from echolume_processing.optical.closed_form import active_points, stereo_points
+from echolume_processing.optical.closed_form import active_points, stereo_block, stereo_points
 
 Points2 = NDArray[np.float64]
 
@@ -78,6 +78,14 @@ def stereo(left: Matrix, right: Matrix, left_px: Points2, right_px: Points2) -> 
         np.ascontiguousarray(left), np.ascontiguousarray(right),
         np.ascontiguousarray(left_px), np.ascontiguousarray(right_px), out,
     )  # fmt: skip
+    return out
+
+
+def stereo_columns(left: Matrix, right: Matrix, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Stereo points (3, n) of image points (4, n): u, v of the left camera, then of the right; see `stereo`."""
+    require_shape("points_px", points_px, (4, None))
+    out = np.empty((3, points_px.shape[1]))
+    stereo_block(left, right, np.ascontiguousarray(points_px), points_px.shape[1], out)
     return out
 
 

@@ -13,13 +13,16 @@ from echolume_messages.geometry import Points3
 from echolume_processing.optical import triangulate
 from echolume_processing.optical.board import CalibrationBoard
 from echolume_processing.optical.camera import Camera
-from echolume_processing.optical.pair_solver import BoardView, PairSolution, fit_pose, solve_from
+from echolume_processing.optical.pair_covariance import PairCovariance
+from echolume_processing.optical.pair_solver import ADVICE, BoardView, PairSolution, fit_pose, solve_from
 
 MIN_VIEWS = 5
 """With fewer, four would not be left to calibrate from."""
 MAX_LEFT_OUT_PX = 1.0
 MAX_LEFT_OUT_SQUARES = 0.05
 """Triangulated corners of a view left out may be off by this share of a square, RMS over the view."""
+MAX_FOCAL_SIGMA = 0.005
+"""Relative standard deviation of a focal length; distances are uncertain by as much."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +75,28 @@ def leave_one_out(
         shape = view.shape_mm(board)
         mm[k] = np.sqrt(np.mean(np.sum((points - rigid_fit(shape, points)) ** 2, axis=1)))
     return LeftOut([v.name for v in views], px, mm)
+
+
+def require_determined(found: PairSolution, covariance: PairCovariance) -> None:
+    """Raise the reason if the views leave a focal length open.
+
+    Raises
+    ------
+    CalibrationRejectedError
+        Names the camera.
+
+    Notes
+    -----
+    Views that are all alike fit each other well, left out or not; only the covariance tells.
+    """
+    for side, camera in (("left", found.left), ("right", found.right)):
+        for axis, name in ((0, "fx"), (1, "fy")):
+            sigma_px, focal_px = covariance.sigmas[f"{side} {name}_px"], float(camera.matrix[axis, axis])
+            if sigma_px > MAX_FOCAL_SIGMA * focal_px:
+                raise CalibrationRejectedError(
+                    f"calibrate cameras: rejected: the views determine the {side} camera's {name} to {focal_px:.0f} +- "
+                    f"{sigma_px:.0f} px only, {MAX_FOCAL_SIGMA:.1%} is needed: {ADVICE}"
+                )
 
 
 def require_accepted(left_out: LeftOut, square_mm: float) -> None:

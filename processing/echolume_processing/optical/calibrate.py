@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 
 from echolume_messages.errors import CalibrationRejectedError
 from echolume_messages.types import Frame
-from echolume_processing.optical.acceptance import LeftOut, leave_one_out, measure_board, require_accepted
+from echolume_processing.optical.acceptance import (
+    LeftOut,
+    leave_one_out,
+    measure_board,
+    require_accepted,
+    require_determined,
+)
 from echolume_processing.optical.board import CalibrationBoard, Corners, Pattern
 from echolume_processing.optical.camera import Camera
 from echolume_processing.optical.pair_covariance import PairCovariance, pair_covariance
@@ -197,6 +203,8 @@ def calibrate_views(
         k, reason = bad
         rejected[used[k].name] = reason
         del used[k]
+    covariance = pair_covariance(found, used, board)
+    require_determined(found, covariance)
     left_out = leave_one_out(found, used, board, image_size_px)
     require_accepted(left_out, board.square_mm)
     return CameraPair(
@@ -209,7 +217,7 @@ def calibrate_views(
         found.view_rms_px,
         rejected,
         _squares(found, used, board),
-        pair_covariance(found, used, board),
+        covariance,
         left_out,
     )
 

@@ -18,7 +18,7 @@ CORNERS_IN_CELL = 2
 MIN_TILT = 0.03
 """Relative change of scale across the board that counts as a tilt."""
 MIN_MOVE = 0.03
-"""A board that has moved by less than this share of the image's width is the same view."""
+"""Of the image's width: a board whose corners have moved by less, and that is not tilted otherwise, is the same view."""
 _ROWS = ("top", "middle", "bottom")
 _COLUMNS = ("left", "centre", "right")
 TILTS = ("left side", "right side", "top", "bottom")
@@ -87,8 +87,9 @@ class Coverage:
         for a, b in ((one.left_px, other.left_px), (one.right_px, other.right_px)):
             if a.shape != b.shape:
                 return False
-            moved = max(moved, float(np.sqrt(np.mean(np.sum((a - b) ** 2, axis=1)))))
-        return moved < MIN_MOVE * self.size_px[0]
+            moved = max(moved, float(np.linalg.norm(a - b, axis=1).max()))
+        turned = np.abs(np.subtract(self.recession(one), self.recession(other))).max()
+        return moved < MIN_MOVE * self.size_px[0] and bool(turned < MIN_TILT)
 
 
 def _scale_change(shape: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echolume_messages import geometry
+from echolume_messages.errors import CalibrationRejectedError
 from echolume_processing.optical.board import CalibrationBoard
-from echolume_processing.optical.pair_solver import BoardView, PairSolution, adjoint, jacobian
+from echolume_processing.optical.pair_solver import ADVICE, BoardView, PairSolution, adjoint, jacobian
 
 Values = NDArray[np.float64]
 
@@ -22,6 +23,7 @@ NAMES = (
 )
 """What the rows of the covariance stand for; rotations are small ones in the right camera's frame."""
 _K3 = 8, 17
+WORST_CONDITION = 1e12
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,11 @@ def pair_covariance(found: PairSolution, views: Sequence[BoardView], board: Cali
     -------
     PairCovariance
 
+    Raises
+    ------
+    CalibrationRejectedError
+        If the views leave a parameter open.
+
     Notes
     -----
     ``noise^2 (J^T J)^-1`` with the poses eliminated view by view (Schur complement). Errors that neighbouring corners
@@ -94,7 +101,13 @@ def pair_covariance(found: PairSolution, views: Sequence[BoardView], board: Cali
     unknowns = int(free.sum()) + 6 * len(views)
     variance = squares / max(count - unknowns, 1)
     kept = normal[np.ix_(free, free)]
-    scale = 1 / np.sqrt(np.diag(kept))  # focal lengths and distortions differ by many orders of magnitude
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = 1 / np.sqrt(np.diag(kept))  # focal lengths and distortions differ by many orders of magnitude
+    scaled = kept * np.outer(scale, scale)
+    if not np.isfinite(scaled).all() or float(np.linalg.cond(scaled)) > WORST_CONDITION:
+        raise CalibrationRejectedError(
+            f"calibrate cameras: rejected: the views do not determine the cameras: {ADVICE}"
+        )
     out = np.zeros((total, total))
-    out[np.ix_(free, free)] = variance * scale[:, None] * np.linalg.inv(kept * np.outer(scale, scale)) * scale
+    out[np.ix_(free, free)] = variance * scale[:, None] * np.linalg.inv(scaled) * scale
     return PairCovariance(out, float(np.sqrt(variance)))

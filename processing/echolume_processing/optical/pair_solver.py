@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echolume_messages import geometry
+from echolume_messages.errors import CalibrationRejectedError
 from echolume_messages.geometry import Matrix, Points3
 from echolume_processing.optical.board import CalibrationBoard, Points2
 from echolume_processing.optical.camera import Camera
@@ -21,6 +22,7 @@ K3_SIGMAS = 3.0
 """k3 is held at 0 unless it stands out from its own sigma: otherwise it only bends the image beyond the boards."""
 CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-7)
 POSE_ROUNDS = 20
+ADVICE = "tilt the board by 15 degrees or more, each time to another side"
 
 
 @dataclass(frozen=True)
@@ -61,12 +63,19 @@ class PairSolution:
 
 
 @contextmanager
-def one_thread() -> Generator[None]:
-    """OpenCV's threads add up in any order, so the last bits of a solution would differ from run to run."""
+def solving() -> Generator[None]:
+    """One thread, and a reason where OpenCV gives up.
+
+    OpenCV's threads add up in any order, so the last bits of a solution would differ from run to run.
+    """
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
         yield
+    except (cv2.error, np.linalg.LinAlgError) as error:
+        raise CalibrationRejectedError(
+            f"calibrate cameras: rejected: the views do not determine the cameras ({error}): {ADVICE}"
+        ) from error
     finally:
         cv2.setNumThreads(before)
 
@@ -81,7 +90,7 @@ def solve(views: Sequence[BoardView], board: CalibrationBoard, size_px: tuple[in
     size_px : (int, int)
         Columns and rows of the images.
     """
-    with one_thread():
+    with solving():
         shape, left, right = _arrays(views, board)
         free = [cv2.calibrateCameraExtended(shape, px, size_px, np.eye(3), np.zeros(5)) for px in (left, right)]
         third = max(abs(_vector(f[2])[4]) / _vector(f[5])[8] for f in free) > K3_SIGMAS  # |k3| over its sigma
@@ -101,7 +110,7 @@ def solve_from(
     start: PairSolution, views: Sequence[BoardView], board: CalibrationBoard, size_px: tuple[int, int]
 ) -> PairSolution:
     """The solution for other views of the same cameras, quicker than `solve` as it begins near the answer."""
-    with one_thread():
+    with solving():
         cameras = start.left.matrix, start.left.distortion, start.right.matrix, start.right.distortion
         nan = float("nan")
         return _together(*_arrays(views, board), cameras, size_px, start.third_radial, (nan, nan))
@@ -194,7 +203,8 @@ def fit_pose(
             rms[side] = np.sqrt(np.mean(residual**2) * 2)
             normal += j.T @ j
             right += j.T @ residual
-        step = np.asarray(np.linalg.solve(normal, right), dtype=np.float64)
+        with solving():
+            step = np.asarray(np.linalg.solve(normal, right), dtype=np.float64)
         pose = geometry.transform(geometry.rotation_from_vector(step[:3]), step[3:]) @ pose
         if float(np.abs(step).max()) < 1e-9:
             break

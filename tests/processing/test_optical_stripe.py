@@ -111,7 +111,7 @@ def test_frames_narrower_than_the_flanks_are_survived() -> None:
 
 
 def test_a_frame_that_is_not_uint8_is_refused() -> None:
-    with pytest.raises(ValueError, match="expected uint8, got float64"):
+    with pytest.raises(ValueError, match="expected uint8 or uint16, got float64"):
         extract(np.zeros((4, 40)))  # pyright: ignore[reportArgumentType]
 
 

@@ -1,0 +1,454 @@
+"""The compiled pass over a frame: where each row's peaks stand out, and the measurement of each.
+
+The frame is read once, as words of two pixels. Shifted views share one index and each reduction stands alone: only
+then does the compiler use whole vector registers.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit, types
+from numba.extending import overload
+from numpy.typing import NDArray
+
+from echolume_processing.optical.stripe_filters import FWHM, HALF, PER_PX, PHASE_BITS, PHASES, WIDTHS
+
+Pixels = NDArray[Any]
+"""uint8 or uint16."""
+Words = NDArray[Any]
+"""Two pixels each."""
+Values = NDArray[np.float64]
+
+FLANK_PX = 14
+"""Distance at which a stripe must have faded; beyond it another peak may stand."""
+FLANK = FLANK_PX // 2
+PAD = FLANK + 1
+BLOCK = 128
+"""Pairs whose largest possible response is bounded together."""
+ROWS = 8
+"""Rows that are prepared together, so that no pair is loaded while it is still being stored."""
+WINDOW = 80
+MIDDLE = WINDOW // 2
+CHUNKS = 4
+CHUNK = 64
+NOISE_DIFFERENCE = 1.1284
+"""Mean absolute difference of two normal samples of unit sigma."""
+NOISE_LARGEST_LEFT_OUT = 0.978
+"""What leaving out the largest of four estimates of 64 samples leaves of the mean."""
+MIN_NOISE_DN = 0.3
+SIGMA_FACTOR = 2 / math.sqrt(math.pi)
+NEAR_PX = 0.3
+"""A filter answers in proportion as long as its centre is off by less."""
+FAR_PX = 3.0
+FLOOR_SIGMAS = 0.5
+"""The brighter flank of a box is seldom further below the block's mean."""
+HOT = 0.25
+"""A lone pixel's neighbours are below this part of it."""
+REJECTED = 8
+"""Peaks of a row that may turn out to be none before the row is given up."""
+EXACT = np.uint32(1 << 15)
+LEVELS = (0.3, 0.8)
+"""Parts of a clipped stripe's height at which its flanks are measured."""
+
+# Columns of the table of results.
+COLUMN, WIDTH, AMPLITUDE, SIGMA, SATURATED, RESULTS = 0, 1, 2, 3, 4, 5
+
+
+def _mean_of_two(word: Any) -> Any:
+    """Mean of the two pixels of a word."""
+    raise NotImplementedError("compiled only")
+
+
+@overload(_mean_of_two, strict=False)
+def _mean_of_two_compiled(word: types.Type) -> Any:
+    if word == types.uint16:
+        return lambda word: np.uint8(
+            np.uint16(np.uint16(word & np.uint16(255)) + np.uint16(word >> np.uint16(8)) + np.uint16(1)) >> np.uint16(1)
+        )
+    return lambda word: np.uint16(
+        np.uint32(np.uint32(word & np.uint32(65535)) + np.uint32(word >> np.uint32(16)) + np.uint32(1)) >> np.uint32(1)
+    )
+
+
+def _placed(value: Any, place: int) -> Any:
+    """A response with its place in the lower half, in the narrowest type that holds both."""
+    raise NotImplementedError("compiled only")
+
+
+@overload(_placed, strict=False)
+def _placed_compiled(value: types.Type, place: types.Type) -> Any:
+    del place
+    if value == types.uint8:
+        return lambda value, place: np.uint16(np.uint16(np.uint16(value) << np.uint16(8)) | np.uint16(place))
+    return lambda value, place: np.uint32(np.uint32(np.uint32(value) << np.uint32(8)) | np.uint32(place))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+def _pairs(words: Words, out: Pixels, largest: Pixels) -> None:
+    """Mean of each word's two pixels, and the largest of each block of them."""
+    for k in range(len(largest)):
+        w = words[k * BLOCK : k * BLOCK + BLOCK]
+        o = out[k * BLOCK : k * BLOCK + BLOCK]
+        high = _mean_of_two(w[0])
+        for i in range(BLOCK):
+            value = _mean_of_two(w[i])
+            o[i] = value
+            high = max(high, value)
+        largest[k] = high
+
+
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+def _floors(pairs: Pixels, margin: float, floors: NDArray[np.int32]) -> None:
+    """What the flanks of each block's boxes hardly fall below: the mean of the darkest block around, less a margin."""
+    blocks = len(floors) // 2
+    for k in range(blocks):
+        p = pairs[k * BLOCK : k * BLOCK + BLOCK]
+        total = np.int32(0)
+        for i in range(BLOCK):
+            total = np.int32(total + np.int32(p[i]))
+        floors[blocks + k] = np.int32(total // BLOCK)
+    for k in range(blocks):
+        around = min(floors[blocks + max(k - 1, 0)], floors[blocks + min(k + 1, blocks - 1)])
+        floors[k] = np.int32(min(floors[blocks + k], around) - np.int32(margin))
+
+
+def _mean(a: Any, b: Any) -> Any:
+    """Mean of two pixels, rounded up."""
+    raise NotImplementedError("compiled only")
+
+
+@overload(_mean, strict=False)
+def _mean_compiled(a: types.Type, b: types.Type) -> Any:
+    del b
+    if a == types.uint8:
+        return lambda a, b: np.uint8(np.uint16(np.uint16(a) + np.uint16(b) + np.uint16(1)) >> np.uint16(1))
+    return lambda a, b: np.uint16(np.uint32(np.uint32(a) + np.uint32(b) + np.uint32(1)) >> np.uint32(1))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+def _respond(pairs: Pixels, out: Pixels) -> None:
+    """How far a box of four pixels stands above the brighter of its flanks."""
+    l0, l1 = pairs[0:], pairs[1:]
+    m0, m1 = pairs[FLANK:], pairs[FLANK + 1 :]
+    r0, r1 = pairs[2 * FLANK :], pairs[2 * FLANK + 1 :]
+    for i in range(BLOCK):
+        flank = max(_mean(l0[i], l1[i]), _mean(r0[i], r1[i]))
+        out[i] = max(_mean(m0[i], m1[i]), flank) - flank
+
+
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+def _strongest(response: Pixels) -> np.uint32:
+    """Largest response of a block with its place: response << 8 | place."""
+    best = _placed(response[0], 0)
+    for i in range(BLOCK):
+        best = max(best, _placed(response[i], i))
+    return np.uint32(best)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+def _busy(row: Pixels, start: int) -> np.int32:
+    """Sum of the absolute differences of neighbours over CHUNK pixels."""
+    a = row[start : start + CHUNK]
+    b = row[start + 1 : start + 1 + CHUNK]
+    total = np.int32(0)
+    for i in range(CHUNK):
+        total = np.int32(total + np.int32(abs(np.int32(np.int32(a[i]) - np.int32(b[i])))))
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+def _noise(row: Pixels) -> float:
+    """Sigma of a row's noise from neighbouring differences in four places; the busiest of them is left out."""
+    columns = len(row)
+    if columns <= CHUNKS * CHUNK:
+        total = 0.0
+        for i in range(columns - 1):
+            total += abs(float(row[i]) - float(row[i + 1]))
+        return max(total / max(columns - 1, 1) / NOISE_DIFFERENCE, MIN_NOISE_DN)
+    total = 0
+    busiest = 0
+    for k in range(CHUNKS):
+        part = _busy(row, (columns * (2 * k + 1)) // (2 * CHUNKS) - CHUNK // 2)
+        total += part
+        busiest = max(busiest, part)
+    mean = float(total - busiest) / ((CHUNKS - 1) * CHUNK)
+    return max(mean / (NOISE_DIFFERENCE * NOISE_LARGEST_LEFT_OUT), MIN_NOISE_DN)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+def _fall(window: Pixels, start: int, level: float, direction: int) -> float:
+    """Distance from `start` to where the profile falls through `level`, at most to the window's end."""
+    before = float(window[start])
+    for i in range(1, MIDDLE - 8):
+        value = float(window[start + direction * i])
+        if value < level:
+            return i - 1 + (before - level) / max(before - value, 1e-9)
+        before = value
+    return float(MIDDLE - 8)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+def _filtered(window: Pixels, centre: int, weights: NDArray[np.int16]) -> float:
+    """Antisymmetric filter around `centre`; positive where the peak lies to the right."""
+    w = window[centre - HALF : centre + HALF]
+    total = np.int32(0)
+    for i in range(len(weights)):  # a length known too early would be unrolled, not vectorised
+        total = np.int32(total + np.int32(np.int32(w[i]) * np.int32(weights[i])))
+    return float(total)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+def _refine(
+    window: Pixels, start: float, at: int, sigma: float, height: float, weights: NDArray[np.int16], slope: Values
+) -> float:
+    """Zero crossing of the filter of width `at` from an estimate of it; nan if it runs away."""
+    x = start
+    for _ in range(4):
+        place = int(x * PHASES + 0.5)
+        chosen = at * PHASES + (place & (PHASES - 1))
+        d = _filtered(window, place >> PHASE_BITS, weights[chosen]) / (slope[chosen] * height)
+        d *= 1 + min(0.25 * d * d / (sigma * sigma), 1.0)
+        x = place / PHASES + d
+        if abs(d) < NEAR_PX:
+            return x
+        if abs(x - start) > FAR_PX:
+            break
+    return math.nan
+
+
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+def _clipped(window: Pixels, top: int, crest: float, background: float, full: float, noise: float, out: Values) -> None:
+    """Fit the flanks of a clipped Gaussian: only they know where it stands."""
+    height = crest - background
+    low, high = background + LEVELS[0] * height, background + LEVELS[1] * height
+    left_low, right_low = _fall(window, top, low, -1), _fall(window, top, low, 1)
+    left_high, right_high = _fall(window, top, high, -1), _fall(window, top, high, 1)
+    wide = 0.5 * (left_low + right_low)
+    narrow = 0.5 * (left_high + right_high)
+    variance = max(wide * wide - narrow * narrow, 0.2) / (2 * math.log(LEVELS[1] / LEVELS[0]))
+    peak = LEVELS[1] * height * math.exp(min(narrow * narrow / (2 * variance), 5.0))
+    x = top + 0.5 * (right_low - left_low)
+    reach = int(3 * math.sqrt(variance)) + 1
+    information = 0.0
+    for _ in range(3):
+        middle = int(x + 0.5)
+        information = 1e-12
+        pull = 0.0
+        for i in range(max(middle - reach, 0), min(middle + reach + 1, WINDOW)):
+            value = float(window[i])
+            if value >= full:
+                continue
+            d = i - x
+            model = peak * math.exp(-d * d / (2 * variance))
+            slope = model * d / variance
+            information += slope * slope
+            pull += slope * (value - background - model)
+        x += min(max(pull / information, -1.0), 1.0)
+    out[COLUMN] = x
+    out[SIGMA] = noise / math.sqrt(information)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+def _measure(
+    window: Pixels,
+    noise: float,
+    full: float,
+    weights: NDArray[np.int16],
+    slope: Values,
+    sigmas: Values,
+    gains: Values,
+    out: Values,
+) -> bool:
+    """Measure the peak in the middle of a window; False if it is none."""
+    top = MIDDLE - 2
+    best = np.int64(0)
+    for i in range(MIDDLE - 3, MIDDLE + 4):
+        smooth = np.int64(window[i - 1]) + 2 * np.int64(window[i]) + np.int64(window[i + 1])
+        if smooth > best:
+            best = smooth
+            top = i
+    beside = np.int64(0)
+    for i in range(4):
+        beside += np.int64(window[MIDDLE - FLANK_PX - 2 + i]) + np.int64(window[MIDDLE + FLANK_PX - 1 + i])
+    background = 0.125 * float(beside)
+    crest = 0.25 * float(best)
+    height = crest - background
+    alone = float(window[top]) - background
+    neighbour = max(float(window[top - 1]), float(window[top + 1])) - background
+    if height <= 0 or neighbour < HOT * alone:
+        return False
+    level = background + 0.5 * height
+    left = _fall(window, top, level, -1)
+    right = _fall(window, top, level, 1)
+    width = left + right
+    out[SATURATED] = 1.0 if crest >= full else 0.0
+    if crest >= full:
+        out[WIDTH] = width
+        out[AMPLITUDE] = height
+        _clipped(window, top, crest, background, full, noise, out)
+        return True
+    at = min(int(PER_PX * width + 0.5), WIDTHS - 1)
+    sigma = sigmas[at]
+    amplitude = height * gains[at]
+    column = _refine(window, top + 0.5 * (right - left), at, sigma, amplitude, weights, slope)
+    out[COLUMN] = column
+    out[WIDTH] = FWHM * sigma + width - at / PER_PX
+    out[AMPLITUDE] = amplitude
+    out[SIGMA] = noise * math.sqrt(SIGMA_FACTOR * sigma) / amplitude
+    return not math.isnan(column)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+def _continued(row: Pixels, start: int, edge: Pixels) -> None:
+    """Copy a window of the row, continued by the border's pixel outside the image."""
+    for i in range(WINDOW):
+        edge[i] = row[min(max(start + i, 0), len(row) - 1)]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+def _search(
+    row: Pixels,
+    pairs: Pixels,
+    bounds: NDArray[np.uint32],
+    order: NDArray[np.uint32],
+    threshold: float,
+    noise: float,
+    full: float,
+    weights: NDArray[np.int16],
+    slope: Values,
+    sigmas: Values,
+    gains: Values,
+    response: Pixels,
+    edge: Pixels,
+    taken: NDArray[np.uint32],
+    out: Values,
+) -> None:
+    """Best first: the block of the largest bound is looked into until a known response is the largest."""
+    wanted = out.shape[0]
+    found = 0
+    gone = 0
+    lowest = np.uint32(np.uint32(threshold) << np.uint32(16))
+    while found < wanted and gone < wanted + REJECTED:
+        best = np.uint32(0)
+        for k in range(len(order)):
+            best = max(best, order[k])
+        if best <= lowest:
+            break
+        k = np.int64(best & np.uint32(255))
+        if not best & EXACT:
+            _respond(pairs[k * BLOCK + PAD - FLANK :], response)
+            for i in range(gone):
+                for j in range(
+                    max(np.int64(taken[i]) - FLANK - k * BLOCK, 0),
+                    min(np.int64(taken[i]) + FLANK + 1 - k * BLOCK, BLOCK),
+                ):
+                    response[j] = 0
+            strongest = np.uint32(_strongest(response))
+            place = np.uint32(strongest & np.uint32(BLOCK - 1))
+            value = np.uint32(strongest >> np.uint32(8))
+            order[k] = np.uint32(value << np.uint32(16)) | EXACT | np.uint32(place << np.uint32(8)) | np.uint32(k)
+            continue
+        at = k * BLOCK + np.int64(np.uint32(best >> np.uint32(8)) & np.uint32(BLOCK - 1))
+        start = 2 * at + 1 - MIDDLE
+        result = out[found]
+        if start >= 0 and start + WINDOW <= len(row):
+            good = _measure(row[start : start + WINDOW], noise, full, weights, slope, sigmas, gains, result)
+        else:
+            _continued(row, start, edge)
+            good = _measure(edge, noise, full, weights, slope, sigmas, gains, result)
+        result[COLUMN] += start
+        if good and 0 <= result[COLUMN] <= len(row) - 1:
+            found += 1
+        else:
+            for i in range(RESULTS):
+                result[i] = np.nan
+        taken[gone] = at
+        gone += 1
+        for i in range(max((at - FLANK) // BLOCK, 0), min((at + FLANK) // BLOCK + 1, len(order))):
+            order[i] = bounds[i] if i != k else np.uint32(np.uint32(best & np.uint32(0xFFFF0000)) | np.uint32(i))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+def extract_rows(
+    frame: Pixels,
+    words: Words,
+    pixels: Pixels,
+    tail: Words,
+    notes: NDArray[np.uint32],
+    floors: NDArray[np.int32],
+    full: float,
+    threshold_sigmas: float,
+    threshold_dn: float,
+    weights: NDArray[np.int16],
+    slope: Values,
+    sigmas: Values,
+    gains: Values,
+    out: Values,
+    noise: Values,
+) -> None:
+    """Fill `out` (rows, candidates, RESULTS), nan before, and `noise` (rows,).
+
+    `words` holds the frame two pixels at a time; `scratch` gives the memory to work in. Noise and background are
+    taken from two of each ROWS rows.
+    """
+    rows, columns = frame.shape
+    whole = words.shape[1] // BLOCK
+    blocks = whole + (1 if words.shape[1] % BLOCK else 0)
+    stride = blocks * BLOCK + 2 * PAD + BLOCK
+    used = ROWS * stride
+    high = pixels[used : used + ROWS * blocks]
+    response = pixels[used + ROWS * blocks :][:BLOCK]
+    edge = pixels[used + ROWS * blocks + BLOCK :]
+    bounds = notes[:blocks]
+    order = notes[blocks : 2 * blocks]
+    taken = notes[2 * blocks :]
+    for first in range(0, rows, ROWS):
+        count = min(ROWS, rows - first)
+        for y in range(count):
+            padded = pixels[y * stride : y * stride + stride]
+            inner = padded[PAD:]
+            _pairs(words[first + y], inner, high[y * blocks : y * blocks + whole])
+            if whole < blocks:
+                for i in range(BLOCK):
+                    tail[i] = words[first + y, min(whole * BLOCK + i, words.shape[1] - 1)]
+                _pairs(tail, inner[whole * BLOCK :], high[y * blocks + whole : y * blocks + blocks])
+            border = inner[0]
+            for i in range(PAD):
+                padded[i] = border
+            border = inner[blocks * BLOCK - 1]
+            for i in range(PAD):
+                inner[blocks * BLOCK + i] = border
+        middle = count // 2
+        sigma = 0.5 * (_noise(frame[first]) + _noise(frame[first + middle]))
+        threshold = max(threshold_sigmas * sigma, threshold_dn)
+        for y in range(count):
+            padded = pixels[y * stride : y * stride + stride]
+            if y in (0, middle):
+                _floors(padded[PAD:], FLOOR_SIGMAS * sigma, floors)
+            noise[first + y] = sigma
+            h = high[y * blocks : y * blocks + blocks]
+            for k in range(blocks):
+                # The last box reaches into the next block.
+                brightest = np.int32(max(h[k], padded[PAD + (k + 1) * BLOCK]))
+                bound = np.uint32(max(np.int32(brightest - floors[k]), np.int32(0)))
+                bounds[k] = np.uint32(np.uint32(bound << np.uint32(16)) | np.uint32(k))
+                order[k] = bounds[k]
+            _search(
+                frame[first + y], padded, bounds, order, threshold, sigma, full,
+                weights, slope, sigmas, gains, response, edge, taken, out[first + y],
+            )  # fmt: skip
+
+
+def scratch(words: Words, candidates: int) -> tuple[Pixels, Words, NDArray[np.uint32], NDArray[np.int32]]:
+    """Memory that the kernel works in: pixels, one block of words, notes and floors."""
+    blocks = -(-words.shape[1] // BLOCK)
+    pixel = np.uint8 if words.dtype == np.uint16 else np.uint16
+    return (
+        np.empty(ROWS * (blocks * BLOCK + 2 * PAD + BLOCK + blocks) + BLOCK + WINDOW, pixel),
+        np.empty(BLOCK, words.dtype),
+        np.empty(2 * blocks + candidates + REJECTED, np.uint32),
+        np.empty(2 * blocks, np.int32),
+    )

@@ -47,10 +47,9 @@ class Lens:
         return self.wavelength_nm * 1e-3 * self.f_number * (1 + magnification) / self.pixel_um
 
     def blur_px(self, focal_px: float) -> float:
-        """Standard deviation of the blur of a point at twice the distance of focus, or endlessly far times |1 - d0/d|.
+        """Blur of an endlessly far point in pixels; a point at distance d is blurred by |1 - focus_mm / d| of it.
 
-        A point at distance d is blurred by ``blur_px * |1 - focus_mm / d|``, the disc of the aperture's image taken
-        as a Gaussian of the same variance.
+        It is a standard deviation: the aperture's disc is taken as a Gaussian of the same variance.
         """
         if self.focus_mm is None:
             return 0.0

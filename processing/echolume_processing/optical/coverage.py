@@ -18,7 +18,7 @@ CORNERS_IN_CELL = 2
 MIN_TILT = 0.03
 """Relative change of scale across the board that counts as a tilt."""
 MIN_MOVE = 0.03
-"""Of the image's width: a board whose corners have moved by less, and that is not tilted otherwise, is the same view."""
+"""Share of the image's width: a board that moved by less, and is not tilted otherwise, is the same view."""
 _ROWS = ("top", "middle", "bottom")
 _COLUMNS = ("left", "centre", "right")
 TILTS = ("left side", "right side", "top", "bottom")

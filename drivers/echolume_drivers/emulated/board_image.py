@@ -8,6 +8,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from echolume_drivers.emulated.light_kernels import images
 from echolume_drivers.emulated.optics import CameraTruth, OpticalTruth, Side, optical_truth
 from echolume_drivers.emulated.sensor import expose
 from echolume_drivers.emulated.stage import Board
@@ -18,7 +19,6 @@ from echolume_drivers.emulated.stripe_image import (
     sensor_of,
     stripe_light,
 )
-from echolume_drivers.emulated.stripe_kernels import images
 from echolume_messages.geometry import Matrix, apply, rotation_from_euler, transform
 from echolume_messages.types import Frame
 

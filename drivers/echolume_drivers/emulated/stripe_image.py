@@ -8,12 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echolume_drivers.emulated.flaws import SHARP_AT_MM
+from echolume_drivers.emulated.light_kernels import cut, glints, images, light, second_stripes, splat
 from echolume_drivers.emulated.optics import OpticalTruth, Side
 from echolume_drivers.emulated.scene import Scene
 from echolume_drivers.emulated.sensor import Sensor, expose
 from echolume_drivers.emulated.speckle import speckle_tile
-from echolume_drivers.emulated.stray_kernels import glints, second_stripes
-from echolume_drivers.emulated.stripe_kernels import cut, images, light, splat
 from echolume_messages.types import Frame
 
 STRIPE_DN_PER_S = 150.0 / 4e-3
@@ -190,7 +189,7 @@ def render_stripe(
     The laser plane is cut with the surface that light meets (below glass: what lies behind it), walls included.
     Each piece is marched towards the laser's head (shadow) and towards the camera (occlusion), projected with
     distortion and drawn with a Gaussian cross section that widens out of focus. Glass weakens the beam on each way;
-    black returns nothing. Glint and second stripes are drawn over it, see `stray_kernels`; room and lamp light the
+    black returns nothing. Glint and second stripes are drawn over it, see `light_kernels`; room and lamp light the
     scene as if it were a flat grey card. Left out: refraction in glass, and light that is scattered more than once.
     """
     camera = truth.camera(side)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import cv2
 import numpy as np
@@ -62,19 +62,21 @@ class Stripe:
 
 
 @cache
-def _compiled() -> Callable[..., None]:
-    """The kernel for 8-bit and 16-bit pixels; frames are handed over read-only, so that there is no third kind."""
+def _compiled(bits: int) -> Callable[..., None]:
+    """The kernel for pixels of 8 or 16 bits; frames are handed over read-only, so that there is one kind of each."""
+    pixel, word = (types.uint8, types.uint16) if bits == 8 else (types.uint16, types.uint32)
+    rows = cast(Any, kernel.extract_rows)
     table, values = types.Array(types.int16, 2, "C"), types.Array(types.float64, 1, "C")
-    for pixel, word in ((types.uint8, types.uint16), (types.uint16, types.uint32)):
-        kernel.extract_rows.compile(
-            (
-                types.Array(pixel, 2, "C", readonly=True), types.Array(word, 2, "C", readonly=True),
-                types.Array(pixel, 1, "C"), types.Array(word, 1, "C"),
-                types.Array(types.uint32, 1, "C"), types.Array(types.int32, 1, "C"), types.float64, types.float64, types.float64,
-                table, values, values, values, types.Array(types.float64, 3, "C"), values,
-            )
-        )  # fmt: skip
-    return kernel.extract_rows
+    rows.compile(
+        (
+            types.Array(pixel, 2, "C", readonly=True), types.Array(word, 2, "C", readonly=True),
+            types.Array(pixel, 1, "C"), types.Array(word, 1, "C"),
+            types.Array(types.uint32, 1, "C"), types.Array(types.int32, 1, "C"),
+            types.float64, types.float64, types.float64,
+            table, values, values, values, types.Array(types.float64, 3, "C"), values,
+        )
+    )  # fmt: skip
+    return rows
 
 
 def speckle_sigma_px(wavelength_mm: float, f_number: float, pixel_mm: float, contrast: float = 1.0) -> float:
@@ -149,7 +151,7 @@ def extract(
     F. Blais and M. Rioux, doi:10.1016/0165-1684(86)90033-2.
     """
     require_shape("frame", frame, (None, None))
-    if frame.dtype not in (np.uint8, np.uint16):
+    if frame.dtype.str not in ("|u1", "<u2"):
         raise ValueError(f"frame: expected uint8 or uint16, got {frame.dtype}")
     if candidates < 1:
         raise ValueError(f"candidates: expected at least 1, got {candidates}")
@@ -165,7 +167,7 @@ def extract(
     out = np.full((rows, candidates, kernel.RESULTS), np.nan)
     noise = np.empty(rows)
     if pixels.size:
-        _compiled()(
+        _compiled(8 * frame.itemsize)(
             pixels, words, *kernel.scratch(words, candidates),
             full * SATURATED_PART, RESPONSE_SIGMAS, full * MIN_RESPONSE_PART,
             table.weights, table.slope, table.sigma_px, table.gain, out, noise,

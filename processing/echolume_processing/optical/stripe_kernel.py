@@ -10,11 +10,10 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit, types
-from numba.extending import overload
 from numpy.typing import NDArray
 
 from echolume_processing.optical.stripe_filters import FWHM, HALF, PER_PX, PHASE_BITS, PHASES, WIDTHS
+from echolume_processing.optical.stripe_words import compiled, mean, mean_of_two, placed
 
 Pixels = NDArray[Any]
 """uint8 or uint16."""
@@ -57,50 +56,21 @@ LEVELS = (0.3, 0.8)
 COLUMN, WIDTH, AMPLITUDE, SIGMA, SATURATED, RESULTS = 0, 1, 2, 3, 4, 5
 
 
-def _mean_of_two(word: Any) -> Any:
-    """Mean of the two pixels of a word."""
-    raise NotImplementedError("compiled only")
-
-
-@overload(_mean_of_two, strict=False)
-def _mean_of_two_compiled(word: types.Type) -> Any:
-    if word == types.uint16:
-        return lambda word: np.uint8(
-            np.uint16(np.uint16(word & np.uint16(255)) + np.uint16(word >> np.uint16(8)) + np.uint16(1)) >> np.uint16(1)
-        )
-    return lambda word: np.uint16(
-        np.uint32(np.uint32(word & np.uint32(65535)) + np.uint32(word >> np.uint32(16)) + np.uint32(1)) >> np.uint32(1)
-    )
-
-
-def _placed(value: Any, place: int) -> Any:
-    """A response with its place in the lower half, in the narrowest type that holds both."""
-    raise NotImplementedError("compiled only")
-
-
-@overload(_placed, strict=False)
-def _placed_compiled(value: types.Type, place: types.Type) -> Any:
-    del place
-    if value == types.uint8:
-        return lambda value, place: np.uint16(np.uint16(np.uint16(value) << np.uint16(8)) | np.uint16(place))
-    return lambda value, place: np.uint32(np.uint32(np.uint32(value) << np.uint32(8)) | np.uint32(place))
-
-
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@compiled
 def _pairs(words: Words, out: Pixels, largest: Pixels) -> None:
     """Mean of each word's two pixels, and the largest of each block of them."""
     for k in range(len(largest)):
         w = words[k * BLOCK : k * BLOCK + BLOCK]
         o = out[k * BLOCK : k * BLOCK + BLOCK]
-        high = _mean_of_two(w[0])
+        high = mean_of_two(w[0])
         for i in range(BLOCK):
-            value = _mean_of_two(w[i])
+            value = mean_of_two(w[i])
             o[i] = value
             high = max(high, value)
         largest[k] = high
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@compiled
 def _floors(pairs: Pixels, margin: float, floors: NDArray[np.int32]) -> None:
     """What the flanks of each block's boxes hardly fall below: the mean of the darkest block around, less a margin."""
     blocks = len(floors) // 2
@@ -115,40 +85,27 @@ def _floors(pairs: Pixels, margin: float, floors: NDArray[np.int32]) -> None:
         floors[k] = np.int32(min(floors[blocks + k], around) - np.int32(margin))
 
 
-def _mean(a: Any, b: Any) -> Any:
-    """Mean of two pixels, rounded up."""
-    raise NotImplementedError("compiled only")
-
-
-@overload(_mean, strict=False)
-def _mean_compiled(a: types.Type, b: types.Type) -> Any:
-    del b
-    if a == types.uint8:
-        return lambda a, b: np.uint8(np.uint16(np.uint16(a) + np.uint16(b) + np.uint16(1)) >> np.uint16(1))
-    return lambda a, b: np.uint16(np.uint32(np.uint32(a) + np.uint32(b) + np.uint32(1)) >> np.uint32(1))
-
-
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@compiled
 def _respond(pairs: Pixels, out: Pixels) -> None:
     """How far a box of four pixels stands above the brighter of its flanks."""
     l0, l1 = pairs[0:], pairs[1:]
     m0, m1 = pairs[FLANK:], pairs[FLANK + 1 :]
     r0, r1 = pairs[2 * FLANK :], pairs[2 * FLANK + 1 :]
     for i in range(BLOCK):
-        flank = max(_mean(l0[i], l1[i]), _mean(r0[i], r1[i]))
-        out[i] = max(_mean(m0[i], m1[i]), flank) - flank
+        flank = max(mean(l0[i], l1[i]), mean(r0[i], r1[i]))
+        out[i] = max(mean(m0[i], m1[i]), flank) - flank
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@compiled
 def _strongest(response: Pixels) -> np.uint32:
     """Largest response of a block with its place: response << 8 | place."""
-    best = _placed(response[0], 0)
+    best = placed(response[0], 0)
     for i in range(BLOCK):
-        best = max(best, _placed(response[i], i))
+        best = max(best, placed(response[i], i))
     return np.uint32(best)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@compiled
 def _busy(row: Pixels, start: int) -> np.int32:
     """Sum of the absolute differences of neighbours over CHUNK pixels."""
     a = row[start : start + CHUNK]
@@ -159,7 +116,7 @@ def _busy(row: Pixels, start: int) -> np.int32:
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@compiled
 def _noise(row: Pixels) -> float:
     """Sigma of a row's noise from neighbouring differences in four places; the busiest of them is left out."""
     columns = len(row)
@@ -174,11 +131,11 @@ def _noise(row: Pixels) -> float:
         part = _busy(row, (columns * (2 * k + 1)) // (2 * CHUNKS) - CHUNK // 2)
         total += part
         busiest = max(busiest, part)
-    mean = float(total - busiest) / ((CHUNKS - 1) * CHUNK)
-    return max(mean / (NOISE_DIFFERENCE * NOISE_LARGEST_LEFT_OUT), MIN_NOISE_DN)
+    usual = float(total - busiest) / ((CHUNKS - 1) * CHUNK)
+    return max(usual / (NOISE_DIFFERENCE * NOISE_LARGEST_LEFT_OUT), MIN_NOISE_DN)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@compiled
 def _fall(window: Pixels, start: int, level: float, direction: int) -> float:
     """Distance from `start` to where the profile falls through `level`, at most to the window's end."""
     before = float(window[start])
@@ -190,7 +147,7 @@ def _fall(window: Pixels, start: int, level: float, direction: int) -> float:
     return float(MIDDLE - 8)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@compiled
 def _filtered(window: Pixels, centre: int, weights: NDArray[np.int16]) -> float:
     """Antisymmetric filter around `centre`; positive where the peak lies to the right."""
     w = window[centre - HALF : centre + HALF]
@@ -200,7 +157,7 @@ def _filtered(window: Pixels, centre: int, weights: NDArray[np.int16]) -> float:
     return float(total)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@compiled
 def _refine(
     window: Pixels, start: float, at: int, sigma: float, height: float, weights: NDArray[np.int16], slope: Values
 ) -> float:
@@ -219,7 +176,7 @@ def _refine(
     return math.nan
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@compiled
 def _clipped(window: Pixels, top: int, crest: float, background: float, full: float, noise: float, out: Values) -> None:
     """Fit the flanks of a clipped Gaussian: only they know where it stands."""
     height = crest - background
@@ -251,7 +208,7 @@ def _clipped(window: Pixels, top: int, crest: float, background: float, full: fl
     out[SIGMA] = noise / math.sqrt(information)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@compiled
 def _measure(
     window: Pixels,
     noise: float,
@@ -301,14 +258,14 @@ def _measure(
     return not math.isnan(column)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@compiled
 def _continued(row: Pixels, start: int, edge: Pixels) -> None:
     """Copy a window of the row, continued by the border's pixel outside the image."""
     for i in range(WINDOW):
         edge[i] = row[min(max(start + i, 0), len(row) - 1)]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@compiled
 def _search(
     row: Pixels,
     pairs: Pixels,
@@ -352,7 +309,7 @@ def _search(
             order[k] = np.uint32(value << np.uint32(16)) | EXACT | np.uint32(place << np.uint32(8)) | np.uint32(k)
             continue
         at = k * BLOCK + np.int64(np.uint32(best >> np.uint32(8)) & np.uint32(BLOCK - 1))
-        start = 2 * at + 1 - MIDDLE
+        start = int(2 * at + 1 - MIDDLE)
         result = out[found]
         if start >= 0 and start + WINDOW <= len(row):
             good = _measure(row[start : start + WINDOW], noise, full, weights, slope, sigmas, gains, result)
@@ -371,7 +328,7 @@ def _search(
             order[i] = bounds[i] if i != k else np.uint32(np.uint32(best & np.uint32(0xFFFF0000)) | np.uint32(i))
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@compiled
 def extract_rows(
     frame: Pixels,
     words: Words,
@@ -394,7 +351,7 @@ def extract_rows(
     `words` holds the frame two pixels at a time; `scratch` gives the memory to work in. Noise and background are
     taken from two of each ROWS rows.
     """
-    rows, columns = frame.shape
+    rows = frame.shape[0]
     whole = words.shape[1] // BLOCK
     blocks = whole + (1 if words.shape[1] % BLOCK else 0)
     stride = blocks * BLOCK + 2 * PAD + BLOCK

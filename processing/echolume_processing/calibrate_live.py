@@ -40,7 +40,10 @@ class PairSource(Protocol):
 
 def camera_pairs(bus: Bus) -> Pairs:
     """Both cameras of a rig; the bus ends the subscriptions."""
-    left, right = (bus.subscribe([topic], depth=DEPTH) for topic in (topics.CAMERA_LEFT, topics.CAMERA_RIGHT))
+    # Not the recorder's archive too: frames of an earlier scan may show cameras that stood otherwise.
+    left, right = (
+        bus.subscribe([topic], depth=DEPTH, archive=False) for topic in (topics.CAMERA_LEFT, topics.CAMERA_RIGHT)
+    )
     return Pairs(left, right)
 
 
@@ -123,7 +126,7 @@ def gather_optics(
     Parameters
     ----------
     pairs : PairSource
-        Passes as `calibrate_optics` takes them.
+        Passes as `calibrate_optics` takes them. When another scan begins, what there was is forgotten.
     board : Pattern
     say : callable
         Told after each board what a calibration from the boards so far lacks.
@@ -145,10 +148,13 @@ def gather_optics(
                 break
             continue
         header = pair[0].header
+        if header.scan != scan:
+            shots, scan, on_board = CalibrationShots(), header.scan, ""
+            say(f"scan {scan}")
         if header.pass_name.startswith(BOARD) and header.pass_name != on_board:
             if on_board:
                 say(f"{on_board}: {_lacks(shots, board)}")
-            on_board, scan = header.pass_name, header.scan
+            on_board = header.pass_name
         for message in pair:
             shots.take(message)
     return calibrate_shots(shots, board)

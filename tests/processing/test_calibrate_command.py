@@ -49,18 +49,19 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @needs_pairs
-def test_the_published_stereo_pairs_calibrate_below_a_quarter_of_a_pixel(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_published_stereo_pairs_calibrate_below_a_fifth_of_a_pixel(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("cameras", str(PAIRS), "--pattern", "9x6", "--square", "25", "--json") == 0
     figures = json.loads(capsys.readouterr().out)
     assert figures["views"] == 13
     assert figures["rejected"] == {}
-    assert figures["left_rms_px"] <= 0.25
-    assert figures["right_rms_px"] <= 0.25
-    assert figures["stereo_rms_px"] <= 0.30
+    assert figures["left_rms_px"] <= 0.17
+    assert figures["right_rms_px"] <= 0.17
+    assert figures["stereo_rms_px"] <= 0.18
+    assert figures["leave_one_out_px"] <= 0.19
     assert figures["published_left_rms_px"] == pytest.approx(0.39259, abs=1e-5)
     assert figures["baseline_mm"] == pytest.approx(83.18, abs=0.1)
-    assert figures["square_mean_mm"] == pytest.approx(25.0, abs=0.05)
-    assert figures["square_sd_mm"] < 0.25
+    assert figures["square_mean_mm"] == pytest.approx(25.0, abs=0.01)
+    assert figures["square_sd_mm"] < 0.11
 
 
 @needs_pairs

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import threading
+import time
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from echolume_messages.calibration import ArrayCalibration, Calibration, CameraC
 from echolume_messages.errors import CalibrationMissingError, CalibrationRejectedError
 from echolume_messages.header import Header, Source
 from echolume_messages.rig_option import load_rig
-from echolume_processing.calibrate_live import gather_optics, gather_views, watch_alignment
+from echolume_processing.calibrate_live import LedgerEnd, gather_optics, gather_views, watch_alignment
 from echolume_processing.commands import calibrate
 from echolume_processing.commands.image_pairs import read_pairs, write_pair
 from echolume_processing.optical.board import Pattern
@@ -141,7 +142,7 @@ def test_the_laser_is_calibrated_while_the_scan_runs() -> None:
         Given(scan_pairs()[:15]), BOARD, said.append, threading.Event(), ended=lambda scan: scan == "calibration"
     )
     assert len(found.report.views) == 5
-    assert said[0] == "board-00: taken; 3 more boards for a first trial"
+    assert said[:2] == ["scan calibration", "board-00: taken; 3 more boards for a first trial"]
     assert said[-1].startswith("board-03: would do: stereo 0.0")
     assert found.report.parallel_deg < 1.0
 
@@ -183,6 +184,30 @@ def calibration_of(rig_name: str) -> Calibration:
     laser = LaserCalibration(normal=(1, 0, 0), offset_mm=0, guide_direction=(1, 0, 0), rms_mm=0)
     sides = camera_of(truth.left), camera_of(truth.right)
     return Calibration(rig=rig_name, left=sides[0], right=sides[1], stereo_rms_px=0.1, laser=laser, array=array)
+
+
+def test_frames_of_a_scan_before_are_forgotten() -> None:
+    blank = np.zeros((1024, 1280), np.uint8)
+    before = [frames(blank, blank, k) for k in range(6)]
+    stop = threading.Event()
+    said: list[str] = []
+    with pytest.raises(CalibrationRejectedError, match=r"1 passes `board-NN` and 0 passes `laser-NN`"):
+        gather_optics(Given([*before, *scan_pairs()[:1]], stop), BOARD, said.append, stop)
+    assert [line for line in said if line.startswith("scan")] == ["scan s", "scan calibration"]
+
+
+def test_a_scan_has_ended_when_its_final_ledger_came(tmp_path: Path) -> None:
+    rig = load_rig(rig_file(tmp_path))
+    with open_router(rig.bus.endpoint), connect(rig.bus.endpoint, rig.name) as bus:
+        ended = LedgerEnd(bus)
+        ledgers = bus.publisher(topics.LEDGER)
+        ledgers.put_json({"scan": "a", "final": False}, scan="a")
+        ledgers.put_json({"scan": "b", "final": True}, scan="b")
+        deadline_s = time.monotonic() + 10
+        while not ended("b"):
+            assert time.monotonic() < deadline_s
+            time.sleep(0.01)
+        assert not ended("a")
 
 
 def camera_of(truth) -> CameraCalibration:

@@ -14,8 +14,8 @@ WIDTHS = 72
 PHASE_BITS = 3
 PHASES = 1 << PHASE_BITS
 """Filters of each width stand this part of a pixel apart, so that one answer next to zero gives the column."""
-HALF = 16
-"""Samples on each side of a filter's centre; the outermost is zero."""
+HALF = 32
+"""Samples on each side of a filter's centre: enough for the widest, and what fills a vector register."""
 TAPS = 2 * HALF
 SCALE = 2047.0
 """Largest weight: sums of 15-bit samples stay within 32 bits."""

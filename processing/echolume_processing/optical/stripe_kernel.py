@@ -29,7 +29,7 @@ BLOCK = 128
 """Pairs whose largest possible response is bounded together."""
 ROWS = 8
 """Rows that are prepared together, so that no pair is loaded while it is still being stored."""
-WINDOW = 80
+WINDOW = 112
 MIDDLE = WINDOW // 2
 CHUNKS = 4
 CHUNK = 64
@@ -49,8 +49,8 @@ HOT = 0.25
 REJECTED = 8
 """Peaks of a row that may turn out to be none before the row is given up."""
 EXACT = np.uint32(1 << 15)
-LEVELS = (0.3, 0.8)
-"""Parts of a clipped stripe's height at which its flanks are measured."""
+CLIP_MARGIN = 2.0
+"""Pixels closer to clipping than so many sigmas of the noise are left to the clipped ones."""
 
 # Columns of the table of results.
 COLUMN, WIDTH, AMPLITUDE, SIGMA, SATURATED, RESULTS = 0, 1, 2, 3, 4, 5
@@ -177,35 +177,61 @@ def _refine(
 
 
 @compiled
-def _clipped(window: Pixels, top: int, crest: float, background: float, full: float, noise: float, out: Values) -> None:
-    """Fit the flanks of a clipped Gaussian: only they know where it stands."""
-    height = crest - background
-    low, high = background + LEVELS[0] * height, background + LEVELS[1] * height
-    left_low, right_low = _fall(window, top, low, -1), _fall(window, top, low, 1)
-    left_high, right_high = _fall(window, top, high, -1), _fall(window, top, high, 1)
-    wide = 0.5 * (left_low + right_low)
-    narrow = 0.5 * (left_high + right_high)
-    variance = max(wide * wide - narrow * narrow, 0.2) / (2 * math.log(LEVELS[1] / LEVELS[0]))
-    peak = LEVELS[1] * height * math.exp(min(narrow * narrow / (2 * variance), 5.0))
-    x = top + 0.5 * (right_low - left_low)
-    reach = int(3 * math.sqrt(variance)) + 1
-    information = 0.0
-    for _ in range(3):
-        middle = int(x + 0.5)
-        information = 1e-12
-        pull = 0.0
-        for i in range(max(middle - reach, 0), min(middle + reach + 1, WINDOW)):
-            value = float(window[i])
-            if value >= full:
+def _clipped(
+    window: Pixels, middle: float, half_width: float, background: float, full: float, noise: float, out: Values
+) -> bool:
+    """Fit the flanks of a clipped Gaussian, which alone know where it stands; False if they say nothing.
+
+    The logarithm is a parabola, found by least squares with the profile as weight; from the second round on weights
+    and residuals are the fit's own, which makes it a Gauss-Newton step on the profile itself.
+    """
+    centre = int(middle + 0.5)
+    reach = min(int(1.7 * half_width) + 3, MIDDLE - 8)
+    limit = full - background - CLIP_MARGIN * noise
+    p0, p1, p2 = 0.0, 0.0, 0.0
+    for step in range(4):
+        s0, s1, s2, s3, s4, t0, t1, t2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for i in range(max(-reach, -centre), min(reach, WINDOW - 1 - centre) + 1):
+            height = float(window[centre + i]) - background
+            if height + background >= full:
                 continue
-            d = i - x
-            model = peak * math.exp(-d * d / (2 * variance))
-            slope = model * d / variance
-            information += slope * slope
-            pull += slope * (value - background - model)
-        x += min(max(pull / information, -1.0), 1.0)
-    out[COLUMN] = x
+            if step == 0:
+                if height < 4 * noise:
+                    continue
+                model, z = height, math.log(height)
+            else:
+                log = p0 + i * (p1 + i * p2)
+                model = math.exp(min(log, 12.0))
+                if model > limit:
+                    continue
+                z = log + (height - model) / max(model, 0.1)
+            w = model * model
+            s0 += w
+            s1 += w * i
+            s2 += w * i * i
+            s3 += w * i * i * i
+            s4 += w * i * i * i * i
+            t0 += w * z
+            t1 += w * z * i
+            t2 += w * z * i * i
+        d0, d1, d2 = s2 * s4 - s3 * s3, s1 * s4 - s2 * s3, s1 * s3 - s2 * s2
+        determinant = s0 * d0 - s1 * d1 + s2 * d2
+        if not determinant > 0:
+            return False
+        p0 = (t0 * d0 - s1 * (t1 * s4 - t2 * s3) + s2 * (t1 * s3 - t2 * s2)) / determinant
+        p1 = (s0 * (t1 * s4 - t2 * s3) - t0 * d1 + s2 * (s1 * t2 - t1 * s2)) / determinant
+        p2 = (s0 * (s2 * t2 - s3 * t1) - s1 * (s1 * t2 - s2 * t1) + t0 * d2) / determinant
+        if not p2 < 0:
+            return False
+    x = -0.5 * p1 / p2
+    information = 1e-12
+    for i in range(-reach, reach + 1):
+        model = math.exp(min(p0 + i * (p1 + i * p2), 12.0))
+        if model <= limit:
+            information += (2 * p2 * (i - x) * model) ** 2
+    out[COLUMN] = centre + x
     out[SIGMA] = noise / math.sqrt(information)
+    return abs(centre + x - middle) < FAR_PX
 
 
 @compiled
@@ -245,8 +271,7 @@ def _measure(
     if crest >= full:
         out[WIDTH] = width
         out[AMPLITUDE] = height
-        _clipped(window, top, crest, background, full, noise, out)
-        return True
+        return _clipped(window, top + 0.5 * (right - left), 0.5 * width, background, full, noise, out)
     at = min(int(PER_PX * width + 0.5), WIDTHS - 1)
     sigma = sigmas[at]
     amplitude = height * gains[at]

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 import zenoh
 
-from daemon.bench import FakeRecorder, free_endpoint, make_rig, wait_until
+from daemon.fake_rig import FakeRecorder, free_endpoint, make_rig, wait_until
 from echolume.main import main
 from echolume_daemon import acquisition, array, cameras, conductor, guide, robot
 from echolume_daemon.commands import scan as scan_command

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.bench import Bench, wait_until
+from daemon.fake_rig import Bench, wait_until
 from echolume_drivers.emulated.rig import toml_text
 
 SNAPS = """

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.bench import Bench, free_endpoint, wait_until
+from daemon.fake_rig import Bench, free_endpoint, wait_until
 from echolume_daemon.client import ScanClient
 from echolume_messages.bus.router import open_router
 from echolume_messages.errors import (

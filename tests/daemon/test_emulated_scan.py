@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.bench import wait_until
+from daemon.fake_rig import wait_until
 from echolume_daemon.client import ScanClient
 from echolume_daemon.ledger import Ledger
 from echolume_drivers.emulated.control import Control

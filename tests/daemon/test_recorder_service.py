@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from daemon.bench import free_endpoint, make_rig, wait_until
+from daemon.fake_rig import free_endpoint, make_rig, wait_until
 from echolume_daemon import recorder
 from echolume_messages import archive, topics
 from echolume_messages.bus import Bus, Publisher, connect

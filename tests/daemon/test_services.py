@@ -14,7 +14,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from daemon.bench import Bench, free_endpoint, make_rig, wait_until
+from daemon.fake_rig import Bench, free_endpoint, make_rig, wait_until
 from echolume_daemon import guide
 from echolume_daemon.body import flag, number, pose6, text, whole
 from echolume_daemon.notify import notify, watchdog_period_s

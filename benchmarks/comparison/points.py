@@ -7,13 +7,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from echolume_drivers.emulated.optics import CameraTruth, OpticalTruth, optical_truth
 from echolume_drivers.emulated.scene import Scene, demo, matte
 from echolume_drivers.emulated.stripe_image import render_stripe, true_stripe
 from echolume_messages.calibration import CameraCalibration, LaserCalibration
 from echolume_messages.types import OpticalSource
-from echolume_processing.optical.pipeline import OpticalPipeline
+from echolume_processing.optical.pipeline import OpticalPipeline, OpticalSettings
 
 EXPOSURE_S = 4e-3
 WRONG_MM = 1.0
@@ -82,21 +83,41 @@ class Tally:
         return 100 * self.found / max(self.rows, 1)
 
 
-def off_mm(points: np.ndarray, lit_mm: np.ndarray) -> np.ndarray:
-    """Distance of each point (n, 3) from the nearest piece (m, 3) of the lit surface."""
-    if len(lit_mm) == 0:
-        return np.full(len(points), np.inf)
-    away = points[:, None, 1:] - lit_mm[None, :, 1:]
-    return np.sqrt(np.min(np.sum(away**2, axis=2), axis=1)) if len(points) else np.zeros(0)
+def fronts(scene: Scene, truth: OpticalTruth, x_mm: float) -> np.ndarray:
+    """Points (n, 3) of what stands within a millimetre of the laser plane, its walls included.
+
+    Edges of glass and of black things glint: a point on them is right, though the map of light leaves them out.
+    """
+    y_mm = np.arange(-119.9, 120, 0.2)
+    found = []
+    for aside_mm in (-1.0, 0.0, 1.0):
+        z_mm = np.zeros(len(y_mm))
+        for _ in range(2):
+            x = truth.plane_offset_mm(x_mm) - truth.laser_normal[1] * y_mm - truth.laser_normal[2] * z_mm + aside_mm
+            ix = np.floor((x - scene.x0_mm) / scene.cell_mm).astype(int)
+            iy = np.floor((y_mm - scene.y0_mm) / scene.cell_mm).astype(int)
+            z_mm = scene.front_mm[iy, np.clip(ix, 0, scene.front_mm.shape[1] - 1)]
+        found.append(np.column_stack([x, y_mm, z_mm]))
+        for i in np.flatnonzero(np.diff(z_mm)):
+            wall_mm = np.arange(min(z_mm[i : i + 2]), max(z_mm[i : i + 2]), 0.2)
+            found.append(np.column_stack([np.full_like(wall_mm, x[i]), np.full_like(wall_mm, y_mm[i]), wall_mm]))
+    return np.concatenate(found)
+
+
+def off_mm(points: np.ndarray, lit: cKDTree) -> np.ndarray:
+    """Distance along the laser plane of OPTICAL_POINTs (n,) from the nearest piece of the lit surface."""
+    return lit.query(np.column_stack([points["y_mm"], points["z_mm"]]))[0]
 
 
 def score(points: np.ndarray, scene: Scene, truth: OpticalTruth, x_mm: float, tally: Tally) -> dict[str, np.ndarray]:
     """Add one stripe's points to the tally; the wrong ones by source."""
     wrong = {}
+    front_mm = fronts(scene, truth, x_mm)
     for side, source in (("left", 2), ("right", 3), ("left", 1)):
         stripe = true_stripe(scene, truth, side, x_mm)
+        lit = cKDTree(np.concatenate([stripe.points_mm, front_mm])[:, 1:])
         mine = points[points["source"] == source]
-        away = off_mm(np.column_stack([mine[a] for a in ("x_mm", "y_mm", "z_mm")]).astype(np.float64), stripe.points_mm)
+        away = off_mm(mine, lit)
         tally.points += len(mine)
         tally.wrong += int(np.count_nonzero(away > WRONG_MM))
         wrong[f"{side}{source}"] = mine[away > WRONG_MM]
@@ -109,12 +130,12 @@ def score(points: np.ndarray, scene: Scene, truth: OpticalTruth, x_mm: float, ta
     return wrong
 
 
-def cluttered(seeds: range, stripes: int = 20, dirty: bool = True) -> Tally:
+def cluttered(seeds: range, stripes: int = 20, dirty: bool = True, settings: OpticalSettings | None = None) -> Tally:
     """Wrong points and completeness on cluttered frames of the demo's scene and its all-matte form."""
     tally = Tally()
     for seed in seeds:
         truth = optical_truth(seed)
-        pipeline = OpticalPipeline.of(camera_of(truth.left), camera_of(truth.right), laser_of(truth))
+        pipeline = OpticalPipeline.of(camera_of(truth.left), camera_of(truth.right), laser_of(truth), settings)
         rng = np.random.default_rng([seed, 77])
         for i, x_mm in enumerate(rng.uniform(-98, 98, stripes)):
             scene = (demo, matte)[i % 2]()

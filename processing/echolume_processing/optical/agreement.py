@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from echolume_messages.geometry import Points3, require_shape
+from echolume_messages.geometry import Matrix
 
 Values = NDArray[np.float64]
 
@@ -58,38 +59,52 @@ def _error_mm(median_mm: float, noise_mm: float, amplification: float) -> float:
     return float(np.sqrt(max(median_mm**2 - noise_mm**2, 0.0)) / MEDIAN_OF_NORMAL / amplification)
 
 
-def plane_amplification(points_mm: Points3, left_centre: Values, right_centre: Values, normal: Values) -> Values:
-    """Change of z(AT-left) - z(AT-right) for each mm of the plane's position, (n,), of points (n, 3).
-
-    Notes
-    -----
-    A point moves along its ray r by r / (n.r) for each mm that the plane moves; about 2 in z for each camera that
-    stands 260 mm aside and 500 mm above, with opposite signs.
-    """
-    require_shape("points_mm", points_mm, (None, 3))
-    left, right = points_mm - left_centre, points_mm - right_centre
-    return left[:, 2] / (left @ normal) - right[:, 2] / (right @ normal)
-
-
-def of_stripe(difference_mm: Values, amplification: Values) -> Agreement:
-    """Agreement of one stripe.
+@njit(cache=True, nogil=True)
+def summary(
+    active: Values, right_px: Values, plane: Matrix, left_centre: Values, right_centre: Values, normal: Values
+) -> tuple[float, float, float, float]:
+    """Median |AT-left - AT-right|, its noise, the amplification, and the median difference of one stripe; compiled.
 
     Parameters
     ----------
-    difference_mm : (n,)
-        z of AT-left minus z of AT-right of the same points, by rows.
-    amplification : (n,)
-        From `plane_amplification`.
+    active : (3, n)
+        AT-left of the points that both cameras see, by rows, in mm.
+    right_px : (2, n)
+        Their undistorted image points in the right camera.
+    plane : (4, 3)
+        `triangulate.plane_from_pixel` of the right camera.
+    left_centre, right_centre, normal : (3,)
+        The cameras' centres in mm, and the laser plane's normal.
+
+    Notes
+    -----
+    When the plane moves by a mm, a point moves along its ray r by r / (n.r): in z by about 2 for a camera that stands
+    260 mm aside and 500 mm above, the other way for the one on the other side. Every fourth row is used.
     """
-    require_shape("amplification", amplification, (len(difference_mm),))
-    n = len(difference_mm)
-    if n < FEW_POINTS:
+    n = active.shape[1]
+    if n <= 2 * LAG_ROWS:
+        return np.nan, np.nan, np.nan, np.nan
+    difference, by_mm = np.empty(n), np.empty(n)
+    for i in range(n):
+        u, v = right_px[0, i], right_px[1, i]
+        scale = 1.0 / (plane[3, 0] * u + plane[3, 1] * v + plane[3, 2])
+        difference[i] = active[2, i] - (plane[2, 0] * u + plane[2, 1] * v + plane[2, 2]) * scale
+        total = 0.0
+        for sign, centre in ((1.0, left_centre), (-1.0, right_centre)):
+            x, y, z = active[0, i] - centre[0], active[1, i] - centre[1], active[2, i] - centre[2]
+            total += sign * z / (x * normal[0] + y * normal[1] + z * normal[2])
+        by_mm[i] = total
+    few = difference[::LAG_ROWS].copy()
+    noise = np.median(np.abs(few[1:] - few[:-1])) / np.sqrt(2.0)
+    return np.median(np.abs(few)), noise, np.median(by_mm[::LAG_ROWS].copy()), np.median(few)
+
+
+def of_stripe(points: int, found: tuple[float, float, float, float]) -> Agreement:
+    """Agreement of one stripe of so many points from what `summary` found."""
+    if points < FEW_POINTS:
         return NONE
-    median_mm = float(np.median(np.abs(difference_mm)))
-    noise_mm = float(np.median(np.abs(difference_mm[LAG_ROWS:] - difference_mm[:-LAG_ROWS])) / np.sqrt(2))
-    by_mm = float(np.median(amplification))
-    plane_mm = float(np.median(difference_mm)) / by_mm
-    return Agreement(n, median_mm, noise_mm, by_mm, plane_mm, _error_mm(median_mm, noise_mm, abs(by_mm)))
+    median_mm, noise_mm, by_mm, middle_mm = found
+    return Agreement(points, median_mm, noise_mm, by_mm, middle_mm / by_mm, _error_mm(median_mm, noise_mm, abs(by_mm)))
 
 
 def of_sweep(stripes: Sequence[Agreement]) -> Agreement:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from echolume_messages.geometry import Matrix, require_shape
-from echolume_processing.optical import lens, triangulate
+from echolume_processing.optical import closed_form, lens, triangulate
 from echolume_processing.optical.camera import Camera
 from echolume_processing.optical.stripe import Stripe
 
@@ -17,83 +17,70 @@ Values = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 
-@dataclass(frozen=True)
-class View:
-    """A camera with what the kernels need of it and of the other one."""
+class View(NamedTuple):
+    """What the kernels need of a camera, and of its place beside the other one."""
 
-    camera: Camera
     projection: Matrix
-    centre_mm: NDArray[np.float64]
+    """M = K [R | t], (3, 4)."""
+    centre_mm: Values
+    """Optical centre, (3,)."""
     ray_matrix: Matrix
-    lens: NDArray[np.float64]
+    """`Camera.ray_matrix`, (3, 3)."""
+    lens: Values
+    """`Camera.lens`, (10,)."""
     f_to_other: Matrix
-
-    @classmethod
-    def of(cls, camera: Camera, other: Camera) -> View:
-        """Of a camera that works together with `other`."""
-        m = np.ascontiguousarray(camera.projection)
-        f = triangulate.fundamental(m, other.projection)
-        return cls(camera, m, camera.centre_mm, np.ascontiguousarray(camera.ray_matrix), camera.lens, f)
+    """Fundamental matrix, ``other_h^T f this_h = 0``, (3, 3)."""
 
 
-@dataclass(frozen=True)
-class Candidates:
-    """The n candidates of one camera, by rows, strongest first.
-
-    Attributes
-    ----------
-    start : (rows + 1,) int64
-        Candidates of row r are start[r] .. start[r + 1] - 1.
-    row : (n,) int64
-        Image row.
-    measured : (4, n) float64
-        Column in the distorted image, its sigma and its width in px, amplitude in digital numbers.
-    saturated : (n,) bool
-        The sensor clipped there.
-    points_px : (2, n) float64
-        Undistorted image point.
-    active_mm : (3, n) float64
-        Point on the laser plane (AT); nan beyond the gates.
-    expected_px : (2, n) float64
-        Where the other camera should see that point: undistorted column, distorted row.
-    """
+class Candidates(NamedTuple):
+    """The n candidates of one camera, by rows, strongest first."""
 
     start: Indices
+    """Candidates of row r are start[r] .. start[r + 1] - 1; (rows + 1,)."""
     row: Indices
+    """Image row, (n,)."""
     measured: Values
+    """Column in the distorted image, its sigma, its width in px, and amplitude in digital numbers; (4, n)."""
     saturated: NDArray[np.bool_]
+    """The sensor clipped there, (n,)."""
     points_px: Values
+    """Undistorted image point, (2, n)."""
     active_mm: Values
+    """Point on the laser plane (AT), (3, n); nan beyond the gates."""
     expected_px: Values
+    """Where the other camera should see that point, (2, n): undistorted column, distorted row."""
 
-    @property
-    def rows(self) -> int:
-        """Rows of the image."""
-        return len(self.start) - 1
 
-    @property
-    def sigma_px(self) -> Values:
-        """Sigma of the column, (n,)."""
-        return self.measured[1]
+def view_of(camera: Camera, other: Camera) -> View:
+    """The view of a camera that works together with `other`."""
+    m = np.ascontiguousarray(camera.projection)
+    f = triangulate.fundamental(m, other.projection)
+    return View(m, camera.centre_mm, np.ascontiguousarray(camera.ray_matrix), camera.lens, np.ascontiguousarray(f))
 
 
 @njit(cache=True, nogil=True)
 def _gather(
-    column: Values, sigma: Values, width: Values, amplitude: Values, saturated: NDArray[np.bool_],
-    start: Indices, row: Indices, measured: Values, clipped: NDArray[np.bool_],
-) -> int:  # fmt: skip
+    column: Values, sigma: Values, width: Values, amplitude: Values, clipped: NDArray[np.bool_]
+) -> tuple[Indices, Indices, Values, NDArray[np.bool_]]:
+    rows, most = column.shape
+    start = np.empty(rows + 1, np.int64)
     n = 0
-    for r in range(column.shape[0]):
+    for r in range(rows):
         start[r] = n
-        for k in range(column.shape[1]):
-            if np.isfinite(column[r, k]):
-                row[n] = r
-                measured[0, n], measured[1, n] = column[r, k], sigma[r, k]
-                measured[2, n], measured[3, n] = width[r, k], amplitude[r, k]
-                clipped[n] = saturated[r, k]
-                n += 1
-    start[column.shape[0]] = n
-    return n
+        for k in range(most):
+            n += not np.isnan(column[r, k])
+    start[rows] = n
+    row, measured, saturated = np.empty(n, np.int64), np.empty((4, n)), np.empty(n, np.bool_)
+    for r in range(rows):
+        i = start[r]
+        for k in range(most):
+            if not np.isnan(column[r, k]):
+                row[i] = r
+                measured[0, i], measured[1, i] = column[r, k], sigma[r, k]
+                measured[2, i], measured[3, i] = width[r, k], amplitude[r, k]
+                saturated[i] = clipped[r, k]
+                i += 1
+    return start, row, measured, saturated
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
@@ -132,13 +119,41 @@ def _close_gates(gates: Values, active: Values, expected: Values) -> None:
             expected[:, i] = np.nan
 
 
-def candidates_of(
-    found: Stripe,
+@njit(cache=True, nogil=True)
+def gather(
+    column: Values,
+    sigma: Values,
+    width: Values,
+    amplitude: Values,
+    clipped: NDArray[np.bool_],
     view: View,
     other: View,
-    normal: NDArray[np.float64],
+    normal: Values,
     distance_mm: float,
-    gates_mm: NDArray[np.float64],
+    gates_mm: Values,
+) -> Candidates:
+    """List the candidates of a frame's `Stripe`, undistort them, and put them on the laser plane; compiled."""
+    start, row, measured, saturated = _gather(column, sigma, width, amplitude, clipped)
+    n = len(row)
+    points, active, expected = np.empty((2, n)), np.empty((3, n)), np.empty((2, n))
+    lens.undistort(measured[0], row.astype(np.float64), view.lens, points[0], points[1])
+    plane = closed_form.plane_from_pixel(view.centre_mm, view.ray_matrix, normal, distance_mm)
+    _place(points, plane, other.projection, other.lens, active, expected)
+    _close_gates(gates_mm, active, expected)
+    return Candidates(start, row, measured, saturated, points, active, expected)
+
+
+def contiguous(found: Stripe) -> tuple[Values, Values, Values, Values, NDArray[np.bool_]]:
+    """What `gather` takes of a stripe, each (rows, k) in C order."""
+    column, sigma, width, amplitude = (
+        np.ascontiguousarray(values, dtype=np.float64)
+        for values in (found.column_px, found.sigma_px, found.width_px, found.amplitude_dn)
+    )
+    return column, sigma, width, amplitude, np.ascontiguousarray(found.saturated)
+
+
+def candidates_of(
+    found: Stripe, view: View, other: View, normal: Values, distance_mm: float, gates_mm: Values
 ) -> Candidates:
     """List the candidates of a frame, undistort them, and put them on the laser plane.
 
@@ -154,19 +169,5 @@ def candidates_of(
         Lowest and highest z, lowest and highest y.
     """
     require_shape("gates_mm", gates_mm, (4,))
-    column = np.ascontiguousarray(found.column_px, dtype=np.float64)
-    rows, most = column.shape[0], column.size
-    start, row = np.empty(rows + 1, dtype=np.int64), np.empty(most, dtype=np.int64)
-    measured, saturated = np.empty((4, most)), np.empty(most, dtype=np.bool_)
-    n = _gather(
-        column, *(np.ascontiguousarray(a, dtype=np.float64) for a in (found.sigma_px, found.width_px)),
-        np.ascontiguousarray(found.amplitude_dn, dtype=np.float64), np.ascontiguousarray(found.saturated),
-        start, row, measured, saturated,
-    )  # fmt: skip
-    row = row[:n]
-    points, active, expected = np.empty((2, n)), np.empty((3, n)), np.empty((2, n))
-    lens.undistort(measured[0, :n], row.astype(np.float64), view.lens, points[0], points[1])
-    plane = triangulate.plane_from_pixel(view.centre_mm, view.ray_matrix, normal, distance_mm)
-    _place(points, plane, other.projection, other.lens, active, expected)
-    _close_gates(gates_mm, active, expected)
-    return Candidates(start, row, np.ascontiguousarray(measured[:, :n]), saturated[:n], points, active, expected)
+    require_shape("normal", normal, (3,))
+    return gather(*contiguous(found), view, other, normal, distance_mm, gates_mm)

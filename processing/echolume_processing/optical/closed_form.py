@@ -69,3 +69,15 @@ def active_points(m: Matrix, points_px: Points, out: Points) -> None:
         out[i, 0] = (m[0, 0] * u + m[0, 1] * v + m[0, 2]) * scale
         out[i, 1] = (m[1, 0] * u + m[1, 1] * v + m[1, 2]) * scale
         out[i, 2] = (m[2, 0] * u + m[2, 1] * v + m[2, 2]) * scale
+
+
+@njit(cache=True, nogil=True)
+def plane_from_pixel(centre: Points, ray_matrix: Matrix, normal: Points, distance: float) -> Matrix:
+    """See `triangulate.plane_from_pixel`."""
+    out = np.empty((4, 3))
+    along = normal[0] * centre[0] + normal[1] * centre[1] + normal[2] * centre[2]
+    for k in range(3):
+        out[3, k] = normal[0] * ray_matrix[0, k] + normal[1] * ray_matrix[1, k] + normal[2] * ray_matrix[2, k]
+        for i in range(3):
+            out[i, k] = centre[i] * out[3, k] + (distance - along) * ray_matrix[i, k]
+    return out

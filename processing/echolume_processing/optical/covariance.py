@@ -17,11 +17,14 @@ Values = NDArray[np.float64]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def _meet(
+def meet(
     points: Values, m: Matrix, third: Matrix, turned: bool, sigma_u: Values, sigma_v: float, sigma_third: Values,
     out: Values,
 ) -> None:  # fmt: skip
-    """Fill `out` (6, n); the third surface is a column of the camera `third`, or if `turned` the plane third[0]."""
+    """Fill `out` (6, n) with the covariance of points (3, n).
+
+    The third surface is a column of the camera `third`, or if `turned` the plane third[0].
+    """
     m00, m01, m02, m10, m11, m12 = m[0, 0], m[0, 1], m[0, 2], m[1, 0], m[1, 1], m[1, 2]
     m20, m21, m22, m03, m13, m23 = m[2, 0], m[2, 1], m[2, 2], m[0, 3], m[1, 3], m[2, 3]
     w00, w01, w02, w03 = third[0, 0], third[0, 1], third[0, 2], third[0, 3]
@@ -69,7 +72,7 @@ def stereo_covariance(
     """
     require_shape("points_mm", points_mm, (3, len(left_px)))
     out = np.empty((6, len(left_px)))
-    _meet(points_mm, left, right, False, left_px, row_px, right_px, out)
+    meet(points_mm, left, right, False, left_px, row_px, right_px, out)
     return out
 
 
@@ -81,14 +84,15 @@ def active_covariance(
     plane = np.zeros((3, 4))
     plane[0, :3], plane[2, 3] = normal, 1.0
     out = np.empty((6, len(column_px)))
-    _meet(points_mm, matrix, plane, True, column_px, row_px, np.full(len(column_px), plane_mm), out)
+    meet(points_mm, matrix, plane, True, column_px, row_px, np.full(len(column_px), plane_mm), out)
     return out
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def _constrain(
+def constrain(
     points: Values, cov: Values, normal: Values, distance: float, variance: float, moved: Values, out: Values
 ) -> None:
+    """See `joint`."""
     nx, ny, nz = normal[0], normal[1], normal[2]
     for i in range(points.shape[1]):
         xx, xy, xz, yy, yz, zz = cov[0, i], cov[1, i], cov[2, i], cov[3, i], cov[4, i], cov[5, i]
@@ -129,7 +133,7 @@ def joint(
     """
     require_shape("covariance", covariance, (6, points_mm.shape[1]))
     moved, out = np.empty_like(points_mm), np.empty_like(covariance)
-    _constrain(points_mm, covariance, normal, distance_mm, plane_mm**2, moved, out)
+    constrain(points_mm, covariance, normal, distance_mm, plane_mm**2, moved, out)
     return moved, out
 
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+
+from echolume_processing.optical.candidates import Candidates
 
 Matrix = NDArray[np.float64]
 Values = NDArray[np.float64]
@@ -14,6 +18,19 @@ MAX_STEP_PX = 2.5
 """Neighbouring rows of one stripe differ by less."""
 REACH_ROWS = 3
 """Rows searched on both sides of the predicted one."""
+
+
+class Match(NamedTuple):
+    """What the other camera says to each of n candidates."""
+
+    partner: Indices
+    """Matched candidate of the other camera, -1 where there is none; (n,)."""
+    points_px: Values
+    """The other camera's undistorted point on the epipolar line, between two rows of its stripe; (2, n)."""
+    off_px: Values
+    """Distance of that point from the column that the laser plane predicts, (n,)."""
+    gain: Values
+    """Variance of that point along the line, over the variance of the partner's column; (n,)."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -97,16 +114,16 @@ def _others(
 
 
 @njit(cache=True, nogil=True)
-def walk(
-    points: Values, expected: Values, start: Indices, other: Values, f: Matrix, tolerance: float,
-    partner: Indices, match: Values, off: Values, gain: Values,
-) -> None:  # fmt: skip
-    """Fill `partner`, `match`, `off` and `gain` of all candidates; see `correspond.Match`."""
-    if other.shape[1] == 0 or len(start) < 3:
+def walk(side: Candidates, other: Candidates, f: Matrix, tolerance: float) -> Match:
+    """See `correspond.walk`."""
+    n, m = len(side.row), len(other.row)
+    partner, match, off, gain = np.empty(n, np.int64), np.empty((2, n)), np.empty(n), np.empty(n)
+    if m == 0 or len(other.start) < 3:
         partner[:] = -1
         match[:] = np.nan
         off[:] = np.nan
         gain[:] = np.nan
-        return
-    _usual(points, expected, start, other, f, tolerance, partner, match, off, gain)
-    _others(points, expected, start, other, f, tolerance, partner, match, off, gain)
+        return Match(partner, match, off, gain)
+    _usual(side.points_px, side.expected_px, other.start, other.points_px, f, tolerance, partner, match, off, gain)
+    _others(side.points_px, side.expected_px, other.start, other.points_px, f, tolerance, partner, match, off, gain)
+    return Match(partner, match, off, gain)

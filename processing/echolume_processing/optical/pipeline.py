@@ -8,19 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echolume_messages.calibration import Calibration, CameraCalibration, LaserCalibration
-from echolume_messages.types import OPTICAL_POINT, Frame, OpticalSource, Structured
-from echolume_processing.optical import agreement, correspond, covariance, select, stripe, triangulate
+from echolume_messages.types import OPTICAL_POINT, Frame, Structured
+from echolume_processing.optical import agreement, chain, covariance, stripe
 from echolume_processing.optical.agreement import Agreement
 from echolume_processing.optical.camera import Camera
-from echolume_processing.optical.candidates import Candidates, View, candidates_of
-from echolume_processing.optical.correspond import Match
+from echolume_processing.optical.candidates import contiguous, view_of
+from echolume_processing.optical.chain import Terms
+from echolume_processing.optical.correspond import TOLERANCE_PX
 from echolume_processing.optical.select import Verdict
 
 Values = NDArray[np.float64]
-
-FEW_BENDS = 30
-SATURATED, BOTH = 1, 2
-"""Bits of a point's flags."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +43,7 @@ class OpticalSettings:
     plane_sigma_mm: float = 0.02
     camera_sigma: float = 0.25
     least_camera_px: float = 0.005
-    run_rows: int = 6
+    run_rows: int = 12
 
 
 @dataclass(frozen=True)
@@ -124,11 +121,14 @@ class OpticalPipeline:
     ) -> None:
         self._settings = settings or OpticalSettings()
         cameras = Camera.of(left), Camera.of(right)
-        self._views = View.of(cameras[0], cameras[1]), View.of(cameras[1], cameras[0])
+        self._views = view_of(cameras[0], cameras[1]), view_of(cameras[1], cameras[0])
         used = self._settings
-        self._camera_px = tuple(max(used.camera_sigma * c.rms_px, used.least_camera_px) for c in (left, right))
-        self._gates_mm = np.array([*used.z_mm, *used.y_mm])
         self._normal = np.asarray(laser.normal, dtype=np.float64)
+        left_px, right_px = (max(used.camera_sigma * c.rms_px, used.least_camera_px) for c in (left, right))
+        self._terms = Terms(
+            np.array([*used.z_mm, *used.y_mm]), self._normal, used.plane_sigma_mm, left_px, right_px,
+            TOLERANCE_PX, used.run_rows,
+        )  # fmt: skip
         self._offset_mm = laser.offset_mm
         self._per_guide_mm = float(self._normal @ np.asarray(laser.guide_direction, dtype=np.float64))
         self._sizes = (left.height_px, left.width_px), (right.height_px, right.width_px)
@@ -196,110 +196,14 @@ class OpticalPipeline:
         for name, frame, size in (("left", left, self._sizes[0]), ("right", right, self._sizes[1])):
             if frame.shape != size:
                 raise ValueError(f"{name} frame: expected shape {size} of the calibration, got {frame.shape}")
-        distance_mm = self._offset_mm + x_mm * self._per_guide_mm
-        views = self._views
-        sides = tuple(
-            candidates_of(
-                stripe.extract(frame), views[i], views[1 - i], self._normal, distance_mm, self._gates_mm
-            )
-            for i, frame in enumerate((left, right))
-        )  # fmt: skip
-        matches = tuple(correspond.walk(sides[i], sides[1 - i], views[i].f_to_other) for i in (0, 1))
-        verdicts = select.choose(sides, matches, self._settings.run_rows)
-        sigmas = tuple(_with_speckle(side, verdict) for side, verdict in zip(sides, verdicts, strict=True))
-        pair = self._pair(sides, matches[0], verdicts, sigmas, distance_mm)
-        alone = [self._active(i, sides[i], verdicts[i], sigmas[i]) for i in (0, 1)]
+        stripes = contiguous(stripe.extract(left)), contiguous(stripe.extract(right))
+        out = np.empty(2 * len(left) + len(right), dtype=OPTICAL_POINT)
+        found = chain.run(*stripes, *self._views, self._terms, self._offset_mm + x_mm * self._per_guide_mm, out)
         return StripePoints(
-            _pack([pair.set, *alone]),
-            np.concatenate([pair.set.covariance, *(s.covariance for s in alone)], axis=1),
-            pair.joint_mm,
-            pair.joint_covariance,
-            tuple(np.bincount(v, minlength=len(Verdict)) for v in verdicts),
-            pair.agreement,
+            out[: found.covariance.shape[1]],
+            found.covariance,
+            found.joint_mm,
+            found.joint_covariance,
+            (found.left_verdicts, found.right_verdicts),
+            agreement.of_stripe(found.joint_mm.shape[1], found.agreement),
         )
-
-    def _pair(
-        self,
-        sides: tuple[Candidates, ...],
-        match: Match,
-        verdicts: tuple[select.Verdicts, ...],
-        sigmas: tuple[Values, ...],
-        distance_mm: float,
-    ) -> _Pair:
-        """Everything that rests on both cameras."""
-        left, right = self._views
-        both = np.flatnonzero(verdicts[0] == Verdict.BOTH)
-        both = both[verdicts[1][match.partner[both]] == Verdict.BOTH]
-        other = match.partner[both]
-        seen = np.concatenate([sides[0].points_px[:, both], match.points_px[:, both]])  # (4, n)
-        points = triangulate.stereo_columns(left.projection, right.projection, seen)
-        sigma_left = np.hypot(sigmas[0][both], self._camera_px[0])
-        sigma_right = np.sqrt(match.gain[both] * sigmas[1][other] ** 2 + self._camera_px[1] ** 2)
-        found = covariance.stereo_covariance(
-            left.projection, right.projection, points, sigma_left, sigma_right, self._camera_px[0]
-        )
-        drawn = covariance.joint(points, found, self._normal, distance_mm, self._settings.plane_sigma_mm)
-        clipped = sides[0].saturated[both] | sides[1].saturated[other]
-        flags = clipped * np.uint8(SATURATED) | np.uint8(BOTH)
-        plane = triangulate.plane_from_pixel(right.centre_mm, right.ray_matrix, self._normal, distance_mm)
-        active_mm = sides[0].active_mm[:, both]
-        difference_mm = active_mm[2] - triangulate.active(plane, np.ascontiguousarray(seen[2:].T))[:, 2]
-        by_mm = agreement.plane_amplification(active_mm.T, left.centre_mm, right.centre_mm, self._normal)
-        chosen = _Set(points, found, flags, sides[0].row[both], OpticalSource.STEREO)
-        return _Pair(chosen, *drawn, agreement.of_stripe(difference_mm, by_mm))
-
-    def _active(self, i: int, side: Candidates, verdict: select.Verdicts, sigma_px: Values) -> _Set:
-        """The active points of one camera."""
-        kept = np.flatnonzero(verdict <= Verdict.ALONE)
-        points = side.active_mm[:, kept]
-        column_px = np.hypot(sigma_px[kept], self._camera_px[i])
-        found = covariance.active_covariance(
-            self._views[i].projection, self._normal, points, column_px, self._camera_px[i],
-            self._settings.plane_sigma_mm,
-        )  # fmt: skip
-        flags = side.saturated[kept] * np.uint8(SATURATED) | (verdict[kept] == Verdict.BOTH) * np.uint8(BOTH)
-        source = OpticalSource.ACTIVE_RIGHT if i else OpticalSource.ACTIVE_LEFT
-        return _Set(points, found, flags, side.row[kept], source)
-
-
-@dataclass(frozen=True)
-class _Set:
-    points_mm: Values
-    covariance: Values
-    flags: NDArray[np.uint8]
-    row: NDArray[np.int64]
-    source: OpticalSource
-
-
-@dataclass(frozen=True)
-class _Pair:
-    set: _Set
-    joint_mm: Values
-    joint_covariance: Values
-    agreement: Agreement
-
-
-def _with_speckle(side: Candidates, verdict: select.Verdicts) -> Values:
-    """Sigma of each column in pixels, (n,): as the extraction states it, and what the stripe itself shows on top."""
-    agreed = verdict == Verdict.BOTH
-    column = np.full(side.rows, np.nan)
-    column[side.row[agreed]] = side.measured[0, agreed]
-    lag = agreement.LAG_ROWS
-    bend = column[2 * lag :] - 2 * column[lag:-lag] + column[: -2 * lag]
-    bend = bend[np.isfinite(bend)]
-    if len(bend) < FEW_BENDS:
-        return side.sigma_px
-    seen_px = 1.4826 * float(np.median(np.abs(bend))) / np.sqrt(6.0)
-    extra = max(seen_px**2 - float(np.median(side.sigma_px[agreed])) ** 2, 0.0)
-    return np.sqrt(side.sigma_px**2 + extra)
-
-
-def _pack(sets: list[_Set]) -> Structured:
-    points = np.concatenate([s.points_mm for s in sets], axis=1)
-    out = np.empty(points.shape[1], dtype=OPTICAL_POINT)
-    out["x_mm"], out["y_mm"], out["z_mm"] = points
-    out["sigma_z_mm"] = np.sqrt(np.concatenate([s.covariance[5] for s in sets]))
-    out["flags"] = np.concatenate([s.flags for s in sets])
-    out["row"] = np.concatenate([s.row for s in sets])
-    out["source"] = np.repeat([s.source for s in sets], [len(s.row) for s in sets])
-    return out

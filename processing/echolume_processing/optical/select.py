@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from echolume_processing.optical.candidates import Candidates
-from echolume_processing.optical.correspond import Match
+from echolume_processing.optical.epipolar import Match
 
 Values = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -40,10 +40,12 @@ class Verdict(IntEnum):
 
 # Plain numbers for the compiled code.
 _BOTH, _ALONE, _OUTSIDE, _SECONDARY, _CONTRADICTED, _ODD, _WEAK, _SHORT = (int(v) for v in Verdict)
+LAST_BELIEVED = int(Verdict.ALONE)
+VERDICTS = len(Verdict)
 
 WIDTH_LOG = 0.45
 """Largest |log| of a lone candidate's width over the usual width."""
-LEAST_OF_USUAL = 0.4
+LEAST_OF_USUAL = 0.5
 """Least amplitude of a lone candidate over the usual one."""
 RIVAL = 2.0
 """A lone candidate must be this much brighter than what the other camera sees on the same row."""
@@ -56,89 +58,106 @@ SURE_ROWS = 40
 """Longer runs are not better."""
 LEAST_OFF_PX, OFF_SIGMAS = 0.7, 4.5
 """How far a pair may lie from where the plane predicts it, besides what all pairs of the stripe have in common."""
+BRIGHTER = 1e5
+"""A row more counts more than any amplitude."""
 FEW = 20
+ENOUGH = 200
+LAG_ROWS = 4
+"""Rows so far apart do not share their speckle grain."""
 
 
 @njit(cache=True, nogil=True)
-def _chain(start: Indices, row: Indices, z: Values, allowed: Flags, before: Indices, after: Indices) -> None:
-    """Rows of the longest smooth run of allowed candidates that ends (`before`) or begins (`after`) at each."""
+def _part(values: Values) -> Values:
+    """Every so many values, some `ENOUGH` of them: all that a median needs."""
+    return values[:: max(len(values) // ENOUGH, 1)].copy()
+
+
+@njit(cache=True, nogil=True)
+def _run_rows(start: Indices, row: Indices, z: Values, allowed: Flags) -> Indices:
+    """Rows of the longest smooth run of allowed candidates through each, 0 where it is not allowed itself."""
     rows = len(start) - 1
-    before[:] = 0
-    after[:] = 0
+    length = np.zeros(len(row), np.int64)  # of the run that ends here, then of the whole
+    after = np.zeros(len(row), np.int64)
     for n in range(len(row)):
-        if not allowed[n]:
-            continue
-        longest = 0
-        for gap in range(1, min(GAP_ROWS, row[n]) + 1):
-            limit = CONTINUITY_MM + CONTINUITY_PER_ROW_MM * (gap - 1)
-            for m in range(start[row[n] - gap], start[row[n] - gap + 1]):
-                if allowed[m] and before[m] > longest and abs(z[m] - z[n]) < limit:
-                    longest = before[m]
-        before[n] = longest + 1
+        if allowed[n]:
+            longest = 0
+            for gap in range(1, min(GAP_ROWS, row[n]) + 1):
+                limit = CONTINUITY_MM + CONTINUITY_PER_ROW_MM * (gap - 1)
+                for m in range(start[row[n] - gap], start[row[n] - gap + 1]):
+                    if length[m] > longest and abs(z[m] - z[n]) < limit:
+                        longest = length[m]
+                if longest > 0:
+                    break
+            length[n] = longest + 1
     for n in range(len(row) - 1, -1, -1):
-        if not allowed[n]:
-            continue
-        longest = 0
-        for gap in range(1, min(GAP_ROWS, rows - 1 - row[n]) + 1):
-            limit = CONTINUITY_MM + CONTINUITY_PER_ROW_MM * (gap - 1)
-            for m in range(start[row[n] + gap], start[row[n] + gap + 1]):
-                if allowed[m] and after[m] > longest and abs(z[m] - z[n]) < limit:
-                    longest = after[m]
-        after[n] = longest + 1
+        if allowed[n]:
+            longest = 0
+            for gap in range(1, min(GAP_ROWS, rows - 1 - row[n]) + 1):
+                limit = CONTINUITY_MM + CONTINUITY_PER_ROW_MM * (gap - 1)
+                for m in range(start[row[n] + gap], start[row[n] + gap + 1]):
+                    if after[m] > longest and abs(z[m] - z[n]) < limit:
+                        longest = after[m]
+                if longest > 0:
+                    break
+            after[n] = longest + 1
+    return np.where(allowed, length + after - 1, 0)
 
 
 @njit(cache=True, nogil=True)
-def _agree(
-    start: Indices, row: Indices, z: Values, amplitude: Values, partner: Indices, off: Values, verdict: Verdicts,
-    agreed: Flags, row_agreed: Flags, before: Indices, after: Indices,
-) -> None:  # fmt: skip
+def _agree(side: Candidates, match: Match) -> tuple[Verdicts, Flags]:
     """Of the candidates that the other camera supports choose one a row: the one of the longest run."""
-    matched = off[partner >= 0]
+    z, amplitude = side.active_mm[2], side.measured[3]
+    off = match.off_px
+    matched = off[match.partner >= 0]
     middle, limit = 0.0, LEAST_OFF_PX + 0.5
     if len(matched) >= FEW:
+        matched = _part(matched)
         middle = np.median(matched)
         limit = max(LEAST_OFF_PX, OFF_SIGMAS * 1.4826 * np.median(np.abs(matched - middle)))
-    for n in range(len(row)):
+    verdict, allowed = np.empty(len(z), np.uint8), np.empty(len(z), np.bool_)
+    for n in range(len(z)):
         verdict[n] = _OUTSIDE if np.isnan(z[n]) else _SHORT
-        agreed[n] = partner[n] >= 0 and abs(off[n] - middle) < limit
-    _chain(start, row, z, agreed, before, after)
-    for r in range(len(start) - 1):
+        allowed[n] = match.partner[n] >= 0 and abs(off[n] - middle) < limit
+    length = _run_rows(side.start, side.row, z, allowed)
+    row_agreed = np.zeros(len(side.start) - 1, np.bool_)
+    for r in range(len(row_agreed)):
         best, chosen = 0.0, -1
-        for n in range(start[r], start[r + 1]):
-            if agreed[n]:
-                length = before[n] + after[n] - 1
-                score = min(length, SURE_ROWS) * 1000.0 + amplitude[n]
-                if length >= LEAST_AGREED_ROWS and score > best:
-                    best, chosen = score, n
-                agreed[n] = False
-        row_agreed[r] = chosen >= 0
+        for n in range(side.start[r], side.start[r + 1]):
+            score = min(length[n], SURE_ROWS) * BRIGHTER + amplitude[n]
+            if length[n] >= LEAST_AGREED_ROWS and score > best:
+                best, chosen = score, n
         if chosen >= 0:
-            agreed[chosen] = True
+            row_agreed[r] = True
             verdict[chosen] = _BOTH
+    return verdict, row_agreed
 
 
 @njit(cache=True, nogil=True)
-def _usual(values: Values, agreed: Flags) -> float:
-    chosen = values[agreed]
-    return np.median(chosen) if len(chosen) >= FEW else np.nan
+def _usual(values: Values, verdict: Verdicts) -> float:
+    """Median over what both cameras agree on, nan while that is little."""
+    chosen = values[verdict == _BOTH]
+    return np.median(_part(chosen)) if len(chosen) >= FEW else np.nan
 
 
 @njit(cache=True, nogil=True)
-def _lone(
-    start: Indices, row: Indices, z: Values, width: Values, amplitude: Values, expected_row: Values,
-    agreed: Flags, row_agreed: Flags, other_agreed: Flags, verdict: Verdicts, alone: Flags,
-) -> None:  # fmt: skip
+def _at(values: NDArray[np.generic], row: float) -> int:
+    """Index of the row nearest to `row`, -1 outside; nan is outside."""
+    return round(row) if -0.5 < row < len(values) - 0.5 else -1
+
+
+@njit(cache=True, nogil=True)
+def _lone(side: Candidates, verdict: Verdicts, row_agreed: Flags, other_agreed: Flags) -> Flags:
     """Of the candidates of rows without agreement choose the brightest that looks like the stripe."""
-    usual_px, usual_dn = _usual(width, agreed), _usual(amplitude, agreed)
-    for r in range(len(start) - 1):
+    width, amplitude = side.measured[2], side.measured[3]
+    usual_px, usual_dn = _usual(width, verdict), _usual(amplitude, verdict)
+    alone = np.zeros(len(width), np.bool_)
+    for r in range(len(row_agreed)):
         best, chosen = 0.0, -1
-        for n in range(start[r], start[r + 1]):
-            alone[n] = False
-            if agreed[n] or np.isnan(z[n]):
+        for n in range(side.start[r], side.start[r + 1]):
+            if verdict[n] != _SHORT:
                 continue
-            seen = expected_row[n]
-            at = round(seen) if -1.0 < seen < len(other_agreed) else -1
-            if row_agreed[r] or (0 <= at < len(other_agreed) and other_agreed[at]):
+            at = _at(other_agreed, side.expected_px[1, n])
+            if row_agreed[r] or (at >= 0 and other_agreed[at]):
                 verdict[n] = _SECONDARY
             elif abs(np.log(width[n] / usual_px)) > WIDTH_LOG:
                 verdict[n] = _ODD
@@ -148,45 +167,48 @@ def _lone(
                 best, chosen = amplitude[n], n
         if chosen >= 0:
             alone[chosen] = True
+    return alone
 
 
 @njit(cache=True, nogil=True)
-def _brightest(start: Indices, amplitude: Values, alone: Flags, out: Values) -> None:
-    for r in range(len(start) - 1):
-        out[r] = 0.0
-        for n in range(start[r], start[r + 1]):
-            if alone[n]:
-                out[r] = amplitude[n]
-
-
-@njit(cache=True, nogil=True)
-def _believe(
-    start: Indices, row: Indices, z: Values, amplitude: Values, expected_row: Values, rival: Values, run_rows: int,
-    agreed: Flags, alone: Flags, verdict: Verdicts, before: Indices, after: Indices,
-) -> None:  # fmt: skip
-    """Keep lone candidates that the other camera does not contradict and that run on for long enough."""
-    for n in range(len(row)):
+def _brightest(side: Candidates, alone: Flags) -> Values:
+    """Amplitude of each row's lone candidate, 0 where there is none; (rows,)."""
+    out = np.zeros(len(side.start) - 1)
+    for n in range(len(alone)):
         if alone[n]:
-            seen = expected_row[n]
-            at = round(seen) if -1.0 < seen < len(rival) else -1
-            if 0 <= at < len(rival) and amplitude[n] < RIVAL * rival[at]:
+            out[side.row[n]] = side.measured[3, n]
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _believe(side: Candidates, alone: Flags, rival_dn: Values, run_rows: int, verdict: Verdicts) -> None:
+    """Keep lone candidates that the other camera does not contradict and that run on for long enough."""
+    for n in range(len(alone)):
+        if alone[n]:
+            at = _at(rival_dn, side.expected_px[1, n])
+            if at >= 0 and side.measured[3, n] < RIVAL * rival_dn[at]:
                 verdict[n] = _CONTRADICTED
                 alone[n] = False
-    _chain(start, row, z, agreed | alone, before, after)
-    for n in range(len(row)):
-        if alone[n] and before[n] + after[n] - 1 >= run_rows:
+    if not alone.any():
+        return
+    length = _run_rows(side.start, side.row, side.active_mm[2], alone | (verdict == _BOTH))
+    for n in range(len(alone)):
+        if alone[n] and length[n] >= run_rows:
             verdict[n] = _ALONE
 
 
-def choose(sides: tuple[Candidates, Candidates], matches: tuple[Match, Match], run_rows: int) -> tuple[Verdicts, ...]:
-    """Judge all candidates; at most one a row is believed in each camera.
+@njit(cache=True, nogil=True)
+def choose(
+    left: Candidates, right: Candidates, to_right: Match, to_left: Match, run_rows: int
+) -> tuple[Verdicts, Verdicts]:
+    """Judge all candidates; at most one a row is believed in each camera. Compiled.
 
     Parameters
     ----------
-    sides : two of Candidates
-        Left and right.
-    matches : two of Match
-        What the other camera says to each.
+    left, right : Candidates
+        Of both cameras.
+    to_right, to_left : Match
+        What the other camera says to the candidates of the left and of the right one.
     run_rows : int
         Rows that must agree where the other camera gives no support.
 
@@ -200,29 +222,47 @@ def choose(sides: tuple[Candidates, Candidates], matches: tuple[Match, Match], r
     Laser ray and image row of a point nearly coincide in the laser plane, so a row holds one lit point: where both
     cameras agree on a point of that row, every other candidate of the row, in either camera, is a reflection.
     """
-    verdicts = tuple(np.empty(len(s.row), dtype=np.uint8) for s in sides)
-    agreed, alone = (tuple(np.empty(len(s.row), dtype=np.bool_) for s in sides) for _ in range(2))
-    row_agreed = tuple(np.empty(s.rows, dtype=np.bool_) for s in sides)
-    runs = tuple(np.empty((2, len(s.row)), dtype=np.int64) for s in sides)
-    for i in (0, 1):
-        s, m = sides[i], matches[i]
-        _agree(
-            s.start, s.row, s.active_mm[2], s.measured[3], m.partner, m.off_px, verdicts[i], agreed[i],
-            row_agreed[i], runs[i][0], runs[i][1],
-        )  # fmt: skip
-    for i in (0, 1):
-        s = sides[i]
-        _lone(
-            s.start, s.row, s.active_mm[2], s.measured[2], s.measured[3], s.expected_px[1], agreed[i],
-            row_agreed[i], row_agreed[1 - i], verdicts[i], alone[i],
-        )  # fmt: skip
-    rivals = tuple(np.empty(s.rows) for s in sides)
-    for i in (0, 1):
-        _brightest(sides[i].start, sides[i].measured[3], alone[i], rivals[i])
-    for i in (0, 1):
-        s = sides[i]
-        _believe(
-            s.start, s.row, s.active_mm[2], s.measured[3], s.expected_px[1], rivals[1 - i], run_rows, agreed[i],
-            alone[i], verdicts[i], runs[i][0], runs[i][1],
-        )  # fmt: skip
-    return verdicts
+    first, rows_first = _agree(left, to_right)
+    second, rows_second = _agree(right, to_left)
+    alone_first = _lone(left, first, rows_first, rows_second)
+    alone_second = _lone(right, second, rows_second, rows_first)
+    rival_first, rival_second = _brightest(left, alone_first), _brightest(right, alone_second)
+    _believe(left, alone_first, rival_second, run_rows, first)
+    _believe(right, alone_second, rival_first, run_rows, second)
+    return first, second
+
+
+@njit(cache=True, nogil=True)
+def pairs(left: Verdicts, right: Verdicts, partner: Indices) -> tuple[Indices, Indices]:
+    """Left and right candidates (n,), (n,) that are believed and belong together; one a row."""
+    index, other = np.empty(len(left), np.int64), np.empty(len(left), np.int64)
+    n = 0
+    for i in range(len(left)):
+        if left[i] == _BOTH and partner[i] >= 0 and right[partner[i]] == _BOTH:
+            index[n], other[n] = i, partner[i]
+            n += 1
+    return index[:n].copy(), other[:n].copy()
+
+
+@njit(cache=True, nogil=True)
+def unexplained_px2(side: Candidates, verdict: Verdicts) -> float:
+    """Variance of the stripe's columns that their stated sigmas leave unexplained: speckle, mostly.
+
+    The columns' second differences over `LAG_ROWS`, so that rows of one grain do not count as smooth.
+    """
+    rows = len(side.start) - 1
+    column, stated = np.full(rows, np.nan), np.full(rows, np.nan)
+    for n in range(len(verdict)):
+        if verdict[n] == _BOTH:
+            column[side.row[n]], stated[side.row[n]] = side.measured[0, n], side.measured[1, n]
+    bend, usual = np.empty(rows), np.empty(rows)
+    n = 0
+    for r in range(LAG_ROWS, rows - LAG_ROWS, 2):
+        value = column[r + LAG_ROWS] - 2.0 * column[r] + column[r - LAG_ROWS]
+        if not np.isnan(value):
+            bend[n], usual[n] = abs(value), stated[r]
+            n += 1
+    if n < FEW:
+        return 0.0
+    seen = 1.4826 * np.median(bend[:n]) / np.sqrt(6.0)
+    return max(seen * seen - np.median(usual[:n]) ** 2, 0.0)

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echolume_messages.geometry import Matrix, Points3, require_shape
+from echolume_processing.optical import closed_form
 from echolume_processing.optical.closed_form import active_points, stereo_block, stereo_points
 
 Points2 = NDArray[np.float64]
@@ -179,9 +180,7 @@ def plane_from_pixel(
     require_shape("centre_mm", centre_mm, (3,))
     require_shape("ray_matrix", ray_matrix, (3, 3))
     require_shape("normal", normal, (3,))
-    slant = normal @ ray_matrix  # (3,)
-    upper = np.outer(centre_mm, slant) + (distance_mm - float(normal @ centre_mm)) * ray_matrix
-    return np.ascontiguousarray(np.vstack([upper, slant]))
+    return closed_form.plane_from_pixel(centre_mm, np.ascontiguousarray(ray_matrix), normal, distance_mm)
 
 
 def active(plane: Matrix, points_px: Points2) -> Points3:

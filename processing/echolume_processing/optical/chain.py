@@ -1,0 +1,164 @@
+"""The compiled chain from both cameras' stripes to points with covariances; `pipeline` is its outside."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from echolume_messages.types import OpticalSource, Structured
+from echolume_processing.optical import agreement, closed_form, covariance, epipolar, select
+from echolume_processing.optical.candidates import Candidates, View, gather
+
+Values = NDArray[np.float64]
+
+SATURATED, BOTH = 1, 2
+"""Bits of a point's flags."""
+_STEREO, _LEFT, _RIGHT = (int(s) for s in OpticalSource)
+
+
+class Terms(NamedTuple):
+    """Gates and error terms of one pipeline."""
+
+    gates_mm: Values
+    """Lowest and highest z, lowest and highest y."""
+    normal: Values
+    """Of the laser plane."""
+    plane_mm: float
+    """Sigma of the laser plane's position."""
+    left_px: float
+    """Sigma of the left camera's model."""
+    right_px: float
+    tolerance_px: float
+    run_rows: int
+
+
+class Found(NamedTuple):
+    """What `run` gives; `pipeline.StripePoints` says more."""
+
+    covariance: Values
+    joint_mm: Values
+    joint_covariance: Values
+    left_verdicts: NDArray[np.int64]
+    right_verdicts: NDArray[np.int64]
+    agreement: tuple[float, float, float, float]
+
+
+@njit(cache=True, nogil=True)
+def _variance(side: Candidates, verdict: select.Verdicts) -> Values:
+    """Variance of each column, (n,): as the extraction states it, and what the stripe itself shows on top."""
+    return side.measured[1] ** 2 + select.unexplained_px2(side, verdict)
+
+
+@njit(cache=True, nogil=True)
+def _write(
+    out: Structured, first: int, points: Values, cov: Values, row: NDArray[np.int64], flags: NDArray[np.uint8],
+    source: int,
+) -> None:  # fmt: skip
+    for i in range(points.shape[1]):
+        point = out[first + i]
+        point.x_mm, point.y_mm, point.z_mm = points[0, i], points[1, i], points[2, i]
+        point.sigma_z_mm = np.sqrt(cov[5, i])
+        point.source, point.flags, point.row = source, flags[i], row[i]
+
+
+@njit(cache=True, nogil=True)
+def _active(
+    side: Candidates, verdict: select.Verdicts, variance: Values, view: View, terms: Terms, camera_px: float,
+    plane: Values, source: int, out: Structured, first: int,
+) -> Values:  # fmt: skip
+    """Write the active points of one camera; their covariance (6, n)."""
+    kept = np.flatnonzero(verdict <= select.LAST_BELIEVED)
+    n = len(kept)
+    points, sigma = np.empty((3, n)), np.empty(n)
+    row, flags = np.empty(n, np.int64), np.empty(n, np.uint8)
+    for i in range(n):
+        k = kept[i]
+        points[0, i], points[1, i], points[2, i] = side.active_mm[0, k], side.active_mm[1, k], side.active_mm[2, k]
+        sigma[i] = np.sqrt(variance[k] + camera_px * camera_px)
+        row[i] = side.row[k]
+        flags[i] = SATURATED * side.saturated[k] + BOTH * (verdict[k] == 0)
+    found = np.empty((6, n))
+    covariance.meet(
+        points, view.projection, plane, True, sigma, camera_px, np.full(n, terms.plane_mm), found
+    )  # fmt: skip
+    _write(out, first, points, found, row, flags, source)
+    return found
+
+
+@njit(cache=True, nogil=True)
+def run(
+    left_stripe: tuple[Values, Values, Values, Values, NDArray[np.bool_]],
+    right_stripe: tuple[Values, Values, Values, Values, NDArray[np.bool_]],
+    left: View,
+    right: View,
+    terms: Terms,
+    distance_mm: float,
+    out: Structured,
+) -> Found:
+    """Fill `out` with OPTICAL_POINTs: stereo, active left, active right; there are as many as covariances.
+
+    Parameters
+    ----------
+    left_stripe, right_stripe : tuples
+        `candidates.contiguous` of both cameras' stripes.
+    left, right : View
+        The cameras.
+    terms : Terms
+        Gates and error terms.
+    distance_mm : float
+        n.X of the laser plane.
+    out : (at least the rows of left twice and of right once,) OPTICAL_POINT
+        Filled.
+    """
+    a, b, c, d, e = left_stripe
+    first = gather(a, b, c, d, e, left, right, terms.normal, distance_mm, terms.gates_mm)
+    a, b, c, d, e = right_stripe
+    second = gather(a, b, c, d, e, right, left, terms.normal, distance_mm, terms.gates_mm)
+    to_right = epipolar.walk(first, second, left.f_to_other, terms.tolerance_px)
+    to_left = epipolar.walk(second, first, right.f_to_other, terms.tolerance_px)
+    verdicts = select.choose(first, second, to_right, to_left, terms.run_rows)
+    variances = _variance(first, verdicts[0]), _variance(second, verdicts[1])
+
+    index, other = select.pairs(verdicts[0], verdicts[1], to_right.partner)
+    n = len(index)
+    seen, active = np.empty((4, n)), np.empty((3, n))
+    sigma_left, sigma_right = np.empty(n), np.empty(n)
+    row, flags = np.empty(n, np.int64), np.empty(n, np.uint8)
+    for i in range(n):
+        k, m = index[i], other[i]
+        seen[0, i], seen[1, i] = first.points_px[0, k], first.points_px[1, k]
+        seen[2, i], seen[3, i] = to_right.points_px[0, k], to_right.points_px[1, k]
+        active[0, i], active[1, i], active[2, i] = first.active_mm[0, k], first.active_mm[1, k], first.active_mm[2, k]
+        sigma_left[i] = np.sqrt(variances[0][k] + terms.left_px**2)
+        sigma_right[i] = np.sqrt(to_right.gain[k] * variances[1][m] + terms.right_px**2)
+        row[i] = first.row[k]
+        flags[i] = SATURATED * (first.saturated[k] or second.saturated[m]) + BOTH
+    points, stereo = np.empty((3, n)), np.empty((6, n))
+    closed_form.stereo_block(left.projection, right.projection, seen, n, points)
+    covariance.meet(
+        points, left.projection, right.projection, False, sigma_left, terms.left_px, sigma_right, stereo
+    )  # fmt: skip
+    _write(out, 0, points, stereo, row, flags, _STEREO)
+    joint, joint_covariance = np.empty((3, n)), np.empty((6, n))
+    covariance.constrain(points, stereo, terms.normal, distance_mm, terms.plane_mm**2, joint, joint_covariance)
+    plane = closed_form.plane_from_pixel(right.centre_mm, right.ray_matrix, terms.normal, distance_mm)
+    agreed = agreement.summary(active, seen[2:], plane, left.centre_mm, right.centre_mm, terms.normal)
+
+    surface = np.zeros((3, 4))
+    surface[0, :3] = terms.normal
+    surface[2, 3] = 1.0
+    at_left = _active(first, verdicts[0], variances[0], left, terms, terms.left_px, surface, _LEFT, out, n)
+    at_right = _active(
+        second, verdicts[1], variances[1], right, terms, terms.right_px, surface, _RIGHT, out, n + at_left.shape[1]
+    )  # fmt: skip
+    return Found(
+        np.concatenate((stereo, at_left, at_right), axis=1),
+        joint,
+        joint_covariance,
+        np.bincount(verdicts[0], minlength=select.VERDICTS),
+        np.bincount(verdicts[1], minlength=select.VERDICTS),
+        agreed,
+    )

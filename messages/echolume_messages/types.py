@@ -59,7 +59,7 @@ OPTICAL_POINT = np.dtype(
         ("z_mm", "<f4"),
         ("sigma_z_mm", "<f4"),
         ("source", "u1"),  # OpticalSource
-        ("flags", "u1"),  # bit 0: saturated
+        ("flags", "u1"),  # bit 0: saturated; bit 1: both cameras see it
         ("row", "<u2"),  # image row in the camera that saw it (left for stereo)
     ]
 )

@@ -157,3 +157,30 @@ def test_a_calibration_of_another_rig_is_refused() -> None:
 def test_a_start_that_cannot_be_read_is_named() -> None:
     with pytest.raises(CalibrationMissingError, match="conductor/start seq 3"):
         read_start(start_message(b'{"scan": 5}'), "test", OpticalPipeline)
+
+
+def test_health_tells_the_cameras_agreement_the_labels_and_the_alarm_of_a_plane_that_is_off(stage: Bus) -> None:
+    off_mm = 0.05
+
+    def act() -> None:
+        start_scan(stage, "off", calibration("test"))
+        for trigger, x_mm in enumerate((-40.0, -20.0, 0.0, 20.0)):
+            for topic, frame in zip((topics.CAMERA_LEFT, topics.CAMERA_RIGHT), pair(x_mm), strict=True):
+                source = Source(x_mm=x_mm + off_mm, laser_on=True, frame_id=trigger)
+                stage.publisher(topic).put(frame, scan="off", pass_name="light", trigger=trigger, source=source)
+
+    with stage.subscribe([topics.health("optical")]) as reports:
+        collect(stage, "off", act, 4)
+        deadline_s = time.monotonic() + DEADLINE_S
+        report: dict[str, object] = {}
+        while report.get("scan") != "off" or report.get("stripes") != 4:
+            assert time.monotonic() < deadline_s, report
+            message = reports.get(0.5)
+            if message is not None:
+                whole = message.json()
+                report = whole["agreement"]
+    assert report["alarm"] is True
+    assert report["plane_mm"] == pytest.approx(off_mm, abs=0.01)
+    assert report["median_mm"] > 2 * report["noise_mm"]
+    assert whole["candidates"]["both"] > 3000
+    assert {"left", "right", "outside", "secondary", "contradicted", "odd", "weak", "short"} < set(whole["candidates"])

@@ -43,13 +43,17 @@ class Found(NamedTuple):
     joint_covariance: Values
     left_verdicts: NDArray[np.int64]
     right_verdicts: NDArray[np.int64]
-    agreement: tuple[float, float, float, float]
+    agreement: tuple[float, float, float, float, float]
 
 
 @njit(cache=True, nogil=True)
 def _variance(side: Candidates, verdict: select.Verdicts) -> Values:
     """Variance of each column, (n,): as the extraction states it, and what the stripe itself shows on top."""
-    return side.measured[1] ** 2 + select.unexplained_px2(side, verdict)
+    extra = select.unexplained_px2(side, verdict)
+    out = np.empty(len(verdict))
+    for n in range(len(out)):
+        out[n] = side.measured[1, n] * side.measured[1, n] + extra
+    return out
 
 
 @njit(cache=True, nogil=True)
@@ -70,19 +74,23 @@ def _active(
     plane: Values, source: int, out: Structured, first: int,
 ) -> Values:  # fmt: skip
     """Write the active points of one camera; their covariance (6, n)."""
-    kept = np.flatnonzero(verdict <= select.LAST_BELIEVED)
-    n = len(kept)
-    points, sigma = np.empty((3, n)), np.empty(n)
+    kept, n = np.empty(len(verdict), np.int64), 0
+    for k in range(len(verdict)):
+        if verdict[k] <= select.LAST_BELIEVED:
+            kept[n] = k
+            n += 1
+    points, sigma, plane_mm = np.empty((3, n)), np.empty(n), np.empty(n)
     row, flags = np.empty(n, np.int64), np.empty(n, np.uint8)
     for i in range(n):
         k = kept[i]
         points[0, i], points[1, i], points[2, i] = side.active_mm[0, k], side.active_mm[1, k], side.active_mm[2, k]
         sigma[i] = np.sqrt(variance[k] + camera_px * camera_px)
+        plane_mm[i] = terms.plane_mm
         row[i] = side.row[k]
         flags[i] = SATURATED * side.saturated[k] + BOTH * (verdict[k] == 0)
     found = np.empty((6, n))
     covariance.meet(
-        points, view.projection, plane, True, sigma, camera_px, np.full(n, terms.plane_mm), found
+        points, view.projection, plane, True, sigma, camera_px, plane_mm, found
     )  # fmt: skip
     _write(out, first, points, found, row, flags, source)
     return found
@@ -154,11 +162,9 @@ def run(
     at_right = _active(
         second, verdicts[1], variances[1], right, terms, terms.right_px, surface, _RIGHT, out, n + at_left.shape[1]
     )  # fmt: skip
-    return Found(
-        np.concatenate((stereo, at_left, at_right), axis=1),
-        joint,
-        joint_covariance,
-        np.bincount(verdicts[0], minlength=select.VERDICTS),
-        np.bincount(verdicts[1], minlength=select.VERDICTS),
-        agreed,
-    )
+    m, last = n + at_left.shape[1], n + at_left.shape[1] + at_right.shape[1]
+    every = np.empty((6, last))
+    for i in range(6):
+        every[i, :n], every[i, n:m], every[i, m:] = stereo[i], at_left[i], at_right[i]
+    left_counts, right_counts = select.count(verdicts[0]), select.count(verdicts[1])
+    return Found(every, joint, joint_covariance, left_counts, right_counts, agreed)

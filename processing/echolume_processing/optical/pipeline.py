@@ -19,6 +19,8 @@ from echolume_processing.optical.select import Verdict
 
 Values = NDArray[np.float64]
 
+ALARM_SIGMAS = 2.0
+
 
 @dataclass(frozen=True)
 class OpticalSettings:
@@ -158,6 +160,11 @@ class OpticalPipeline:
         for frame in frames:
             frame[:, frame.shape[1] // 2 - 2 : frame.shape[1] // 2 + 2] = 180
         OpticalPipeline.of(cameras[0], cameras[1], laser).process(frames[0], frames[1], 0.0)
+
+    @property
+    def plane_limit_mm(self) -> float:
+        """A larger error of the laser plane is not explained by its stated sigma."""
+        return ALARM_SIGMAS * self._settings.plane_sigma_mm
 
     def process(self, left: Frame, right: Frame, x_mm: float) -> Structured:
         """Points of one stripe.

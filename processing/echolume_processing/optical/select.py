@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from echolume_processing.optical.candidates import Candidates
 from echolume_processing.optical.epipolar import Match
+from echolume_processing.optical.middle import median
 
 Values = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -61,15 +62,8 @@ LEAST_OFF_PX, OFF_SIGMAS = 0.7, 4.5
 BRIGHTER = 1e5
 """A row more counts more than any amplitude."""
 FEW = 20
-ENOUGH = 200
 LAG_ROWS = 4
 """Rows so far apart do not share their speckle grain."""
-
-
-@njit(cache=True, nogil=True)
-def _part(values: Values) -> Values:
-    """Every so many values, some `ENOUGH` of them: all that a median needs."""
-    return values[:: max(len(values) // ENOUGH, 1)].copy()
 
 
 @njit(cache=True, nogil=True)
@@ -100,7 +94,10 @@ def _run_rows(start: Indices, row: Indices, z: Values, allowed: Flags) -> Indice
                 if longest > 0:
                     break
             after[n] = longest + 1
-    return np.where(allowed, length + after - 1, 0)
+    for n in range(len(row)):
+        if allowed[n]:
+            length[n] += after[n] - 1
+    return length
 
 
 @njit(cache=True, nogil=True)
@@ -108,12 +105,17 @@ def _agree(side: Candidates, match: Match) -> tuple[Verdicts, Flags]:
     """Of the candidates that the other camera supports choose one a row: the one of the longest run."""
     z, amplitude = side.active_mm[2], side.measured[3]
     off = match.off_px
-    matched = off[match.partner >= 0]
+    matched, count = np.empty(len(off)), 0
+    for n in range(len(off)):
+        if match.partner[n] >= 0:
+            matched[count] = off[n]
+            count += 1
     middle, limit = 0.0, LEAST_OFF_PX + 0.5
-    if len(matched) >= FEW:
-        matched = _part(matched)
-        middle = np.median(matched)
-        limit = max(LEAST_OFF_PX, OFF_SIGMAS * 1.4826 * np.median(np.abs(matched - middle)))
+    if count >= FEW:
+        middle = median(matched, count)
+        for n in range(count):
+            matched[n] = abs(matched[n] - middle)
+        limit = max(LEAST_OFF_PX, OFF_SIGMAS * 1.4826 * median(matched, count))
     verdict, allowed = np.empty(len(z), np.uint8), np.empty(len(z), np.bool_)
     for n in range(len(z)):
         verdict[n] = _OUTSIDE if np.isnan(z[n]) else _SHORT
@@ -135,14 +137,18 @@ def _agree(side: Candidates, match: Match) -> tuple[Verdicts, Flags]:
 @njit(cache=True, nogil=True)
 def _usual(values: Values, verdict: Verdicts) -> float:
     """Median over what both cameras agree on, nan while that is little."""
-    chosen = values[verdict == _BOTH]
-    return np.median(_part(chosen)) if len(chosen) >= FEW else np.nan
+    chosen, count = np.empty(len(values)), 0
+    for n in range(len(values)):
+        if verdict[n] == _BOTH:
+            chosen[count] = values[n]
+            count += 1
+    return median(chosen, count) if count >= FEW else np.nan
 
 
 @njit(cache=True, nogil=True)
-def _at(values: NDArray[np.generic], row: float) -> int:
-    """Index of the row nearest to `row`, -1 outside; nan is outside."""
-    return round(row) if -0.5 < row < len(values) - 0.5 else -1
+def _at(rows: int, row: float) -> int:
+    """The whole row nearest to `row`, -1 outside the image; nan is outside."""
+    return round(row) if -0.5 < row < rows - 0.5 else -1
 
 
 @njit(cache=True, nogil=True)
@@ -156,7 +162,7 @@ def _lone(side: Candidates, verdict: Verdicts, row_agreed: Flags, other_agreed: 
         for n in range(side.start[r], side.start[r + 1]):
             if verdict[n] != _SHORT:
                 continue
-            at = _at(other_agreed, side.expected_px[1, n])
+            at = _at(len(other_agreed), side.expected_px[1, n])
             if row_agreed[r] or (at >= 0 and other_agreed[at]):
                 verdict[n] = _SECONDARY
             elif abs(np.log(width[n] / usual_px)) > WIDTH_LOG:
@@ -183,18 +189,20 @@ def _brightest(side: Candidates, alone: Flags) -> Values:
 @njit(cache=True, nogil=True)
 def _believe(side: Candidates, alone: Flags, rival_dn: Values, run_rows: int, verdict: Verdicts) -> None:
     """Keep lone candidates that the other camera does not contradict and that run on for long enough."""
+    allowed, any_alone = np.empty(len(alone), np.bool_), False
     for n in range(len(alone)):
         if alone[n]:
-            at = _at(rival_dn, side.expected_px[1, n])
+            at = _at(len(rival_dn), side.expected_px[1, n])
             if at >= 0 and side.measured[3, n] < RIVAL * rival_dn[at]:
                 verdict[n] = _CONTRADICTED
                 alone[n] = False
-    if not alone.any():
-        return
-    length = _run_rows(side.start, side.row, side.active_mm[2], alone | (verdict == _BOTH))
-    for n in range(len(alone)):
-        if alone[n] and length[n] >= run_rows:
-            verdict[n] = _ALONE
+        any_alone |= alone[n]
+        allowed[n] = alone[n] or verdict[n] == _BOTH
+    if any_alone:
+        length = _run_rows(side.start, side.row, side.active_mm[2], allowed)
+        for n in range(len(alone)):
+            if alone[n] and length[n] >= run_rows:
+                verdict[n] = _ALONE
 
 
 @njit(cache=True, nogil=True)
@@ -241,7 +249,7 @@ def pairs(left: Verdicts, right: Verdicts, partner: Indices) -> tuple[Indices, I
         if left[i] == _BOTH and partner[i] >= 0 and right[partner[i]] == _BOTH:
             index[n], other[n] = i, partner[i]
             n += 1
-    return index[:n].copy(), other[:n].copy()
+    return index[:n], other[:n]
 
 
 @njit(cache=True, nogil=True)
@@ -264,5 +272,14 @@ def unexplained_px2(side: Candidates, verdict: Verdicts) -> float:
             n += 1
     if n < FEW:
         return 0.0
-    seen = 1.4826 * np.median(bend[:n]) / np.sqrt(6.0)
-    return max(seen * seen - np.median(usual[:n]) ** 2, 0.0)
+    seen, known = 1.4826 * median(bend, n) / np.sqrt(6.0), median(usual, n)
+    return max(seen * seen - known * known, 0.0)
+
+
+@njit(cache=True, nogil=True)
+def count(verdict: Verdicts) -> Indices:
+    """How many candidates met each `Verdict`, (8,)."""
+    out = np.zeros(VERDICTS, np.int64)
+    for n in range(len(verdict)):
+        out[verdict[n]] += 1
+    return out

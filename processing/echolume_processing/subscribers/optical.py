@@ -13,6 +13,7 @@ from echolume_messages import topics
 from echolume_messages.bus import Bus, Message
 from echolume_messages.rig import Rig
 from echolume_processing.optical.pipeline import OpticalPipeline
+from echolume_processing.optical.sweep import Sweep
 from echolume_processing.subscribers.frame import run_subscriber
 from echolume_processing.subscribers.pairing import Pairs
 from echolume_processing.subscribers.scans import Scans
@@ -38,6 +39,8 @@ class OpticalSubscriber:
             self._starts, rig.name, OpticalPipeline, HELD_PAIRS, log
         )
         self._counts = {"stripes": 0, "points": 0, "skipped": 0}
+        self._candidates: dict[str, int] = {}
+        self._sweep = Sweep(log)
         self._busy_ms = 0.0
 
     def step(self, timeout_s: float) -> None:
@@ -53,12 +56,14 @@ class OpticalSubscriber:
             self._take(*pair)
 
     def health(self) -> dict[str, object]:
-        """Counts, the last stripe's processing time, and the state of the subscription."""
+        """Counts, the last stripe's time, what became of all candidates, both cameras' agreement, the subscription."""
         return {
             **self._counts,
             "given_up": self._scans.given_up,
             "unpaired": self._pairs.unpaired,
             "ms_per_pair": round(self._busy_ms, 2),
+            "candidates": dict(self._candidates),
+            "agreement": self._sweep.report(),
             "left": self._left.stats,
             "right": self._right.stats,
         }
@@ -88,13 +93,13 @@ class OpticalSubscriber:
         began_s = time.perf_counter()
         pixels = np.asarray(left.payload, dtype=np.uint8), np.asarray(right.payload, dtype=np.uint8)
         try:
-            points = setup.pipeline.process(pixels[0], pixels[1], header.source.x_mm)
+            found = setup.pipeline.measure(pixels[0], pixels[1], header.source.x_mm)
         except ValueError as error:
             log.error("trigger %d: the stripe is skipped: %s", header.trigger, error)
             self._counts["skipped"] += 1
             return
         self._points.put(
-            points,
+            found.points,
             scan=header.scan,
             pass_name=header.pass_name,
             trigger=header.trigger,
@@ -105,7 +110,11 @@ class OpticalSubscriber:
         )
         self._busy_ms = 1e3 * (time.perf_counter() - began_s)
         self._counts["stripes"] += 1
-        self._counts["points"] += len(points)
+        self._counts["points"] += len(found.points)
+        for name, count in found.counts.items():
+            self._candidates[name] = self._candidates.get(name, 0) + count
+        limit_mm = setup.pipeline.plane_limit_mm
+        self._sweep.add((header.scan, header.pass_name), limit_mm, found.agreement, header.source.x_mm, header.t_ns)
 
 
 def main(

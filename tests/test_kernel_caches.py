@@ -1,7 +1,8 @@
-"""Compiled kernels that are cached on disk rest on nothing outside their own file.
+"""The emulated rig's compiled kernels that are cached on disk rest on nothing outside their own file.
 
 numba renews a cached kernel when its file changes, and not when another file does: a constant or a function that a
 kernel takes from elsewhere would stay as it was when the kernel was first compiled, and change results silently.
+(`processing` forgets its stale kernels by itself, see `echolume_processing.kernel_cache`.)
 """
 
 from __future__ import annotations
@@ -12,12 +13,11 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-ROOMS = ("processing/echolume_processing", "drivers/echolume_drivers")
+ROOM = ROOT / "drivers" / "echolume_drivers"
 
 
 def files_with_kernels() -> list[Path]:
-    found = [path for room in ROOMS for path in sorted((ROOT / room).rglob("*.py"))]
-    return [path for path in found if "cache=True" in path.read_text(encoding="utf-8")]
+    return [path for path in sorted(ROOM.rglob("*.py")) if "cache=True" in path.read_text(encoding="utf-8")]
 
 
 def imported_from_us(tree: ast.Module) -> set[str]:
@@ -35,7 +35,7 @@ def kernels(tree: ast.Module) -> list[ast.FunctionDef]:
 
 
 def test_there_are_kernels() -> None:
-    assert len(files_with_kernels()) >= 4
+    assert len(files_with_kernels()) >= 2
 
 
 @pytest.mark.parametrize("path", files_with_kernels(), ids=lambda path: path.stem)

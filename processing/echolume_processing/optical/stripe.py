@@ -71,9 +71,9 @@ def _compiled(bits: int) -> Callable[..., None]:
         (
             types.Array(pixel, 2, "C", readonly=True), types.Array(word, 2, "C", readonly=True),
             types.Array(pixel, 1, "C"), types.Array(word, 1, "C"),
-            types.Array(types.uint32, 1, "C"), types.Array(types.int32, 1, "C"),
+            types.Array(types.uint32, 1, "C"), types.Array(types.int32, 1, "C"), values,
             types.float64, types.float64, types.float64,
-            table, values, values, values, types.Array(types.float64, 3, "C"), values,
+            table, values, values, values, values, types.Array(types.float64, 3, "C"), values,
         )
     )  # fmt: skip
     return rows
@@ -164,20 +164,22 @@ def extract(
     rows = len(frame) if axis == 1 else frame.shape[1]
     full = float((1 << used) - 1)
     table = filters()
-    out = np.full((rows, candidates, kernel.RESULTS), np.nan)
-    noise = np.empty(rows)
-    if pixels.size:
+    out = np.empty((kernel.RESULTS, rows, candidates))
+    noise = np.full(rows, kernel.MIN_NOISE_DN)
+    if not pixels.size:
+        out.fill(np.nan)
+    else:
         _compiled(8 * frame.itemsize)(
             pixels, words, *kernel.scratch(words, candidates),
             full * SATURATED_PART, RESPONSE_SIGMAS, full * MIN_RESPONSE_PART,
-            table.weights, table.slope, table.sigma_px, table.gain, out, noise,
+            *table, out, noise,
         )  # fmt: skip
-    sigma = out[..., kernel.SIGMA]
+    sigma = out[kernel.SIGMA]
     return Stripe(
-        out[..., kernel.COLUMN],
-        out[..., kernel.WIDTH],
-        out[..., kernel.AMPLITUDE],
-        out[..., kernel.SATURATED] == 1.0,
+        out[kernel.COLUMN],
+        out[kernel.WIDTH],
+        out[kernel.AMPLITUDE],
+        out[kernel.SATURATED] == 1.0,
         noise,
         np.hypot(sigma, speckle_px) if speckle_px else sigma,
     )
@@ -192,10 +194,8 @@ def _words(frame: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     """A frame and the same memory as words of two pixels, both read-only; an odd last column is doubled."""
     if frame.shape[1] % 2:
         frame = np.concatenate([frame, frame[:, -1:]], axis=1)
-    pixels = np.require(frame, requirements=["C", "A"]).view()
+    pixels = np.ascontiguousarray(frame).view()
     if pixels.ctypes.data % (2 * frame.itemsize):
         pixels = pixels.copy()
-    words = pixels.view(np.uint16 if frame.dtype == np.uint8 else np.uint32)
     pixels.flags.writeable = False
-    words.flags.writeable = False
-    return pixels, words
+    return pixels, pixels.view(np.uint16 if frame.dtype == np.uint8 else np.uint32)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from echolume_processing.optical.stripe_filters import FWHM, HALF, PER_PX, PHASE_BITS, PHASES, WIDTHS
+from echolume_processing.optical.stripe_filters import FWHM, HALF, PER_PX, PHASE_BITS, PHASES, SMOOTHING, WIDTHS
 from echolume_processing.optical.stripe_words import compiled, mean, mean_of_two, placed
 
 Pixels = NDArray[Any]
@@ -25,7 +25,8 @@ FLANK_PX = 14
 """Distance at which a stripe must have faded; beyond it another peak may stand."""
 FLANK = FLANK_PX // 2
 PAD = FLANK + 1
-BLOCK = 128
+BLOCK_BITS = 7
+BLOCK = 1 << BLOCK_BITS
 """Pairs whose largest possible response is bounded together."""
 ROWS = 8
 """Rows that are prepared together, so that no pair is loaded while it is still being stored."""
@@ -38,7 +39,6 @@ NOISE_DIFFERENCE = 1.1284
 NOISE_LARGEST_LEFT_OUT = 0.978
 """What leaving out the largest of four estimates of 64 samples leaves of the mean."""
 MIN_NOISE_DN = 0.3
-SIGMA_FACTOR = 2 / math.sqrt(math.pi)
 NEAR_PX = 0.3
 """A filter answers in proportion as long as its centre is off by less."""
 FAR_PX = 3.0
@@ -60,12 +60,12 @@ COLUMN, WIDTH, AMPLITUDE, SIGMA, SATURATED, RESULTS = 0, 1, 2, 3, 4, 5
 def _pairs(words: Words, out: Pixels, largest: Pixels) -> None:
     """Mean of each word's two pixels, and the largest of each block of them."""
     for k in range(len(largest)):
-        w = words[k * BLOCK : k * BLOCK + BLOCK]
-        o = out[k * BLOCK : k * BLOCK + BLOCK]
-        high = mean_of_two(w[0])
+        base = np.uintp(k * BLOCK)  # an unsigned index needs no test for counting from the end
+        high = mean_of_two(words[base])
         for i in range(BLOCK):
-            value = mean_of_two(w[i])
-            o[i] = value
+            at = np.uintp(base + np.uintp(i))
+            value = mean_of_two(words[at])
+            out[at] = value
             high = max(high, value)
         largest[k] = high
 
@@ -243,21 +243,20 @@ def _measure(
     slope: Values,
     sigmas: Values,
     gains: Values,
+    spreads: Values,
     out: Values,
 ) -> bool:
     """Measure the peak in the middle of a window; False if it is none."""
-    top = MIDDLE - 2
     best = np.int64(0)
     for i in range(MIDDLE - 3, MIDDLE + 4):
         smooth = np.int64(window[i - 1]) + 2 * np.int64(window[i]) + np.int64(window[i + 1])
-        if smooth > best:
-            best = smooth
-            top = i
+        best = max(best, (smooth << 8) | i)
+    top = int(best & 255)
     beside = np.int64(0)
     for i in range(4):
         beside += np.int64(window[MIDDLE - FLANK_PX - 2 + i]) + np.int64(window[MIDDLE + FLANK_PX - 1 + i])
     background = 0.125 * float(beside)
-    crest = 0.25 * float(best)
+    crest = 0.25 * float(best >> 8)
     height = crest - background
     alone = float(window[top]) - background
     neighbour = max(float(window[top - 1]), float(window[top + 1])) - background
@@ -274,20 +273,27 @@ def _measure(
         return _clipped(window, top + 0.5 * (right - left), 0.5 * width, background, full, noise, out)
     at = min(int(PER_PX * width + 0.5), WIDTHS - 1)
     sigma = sigmas[at]
-    amplitude = height * gains[at]
-    column = _refine(window, top + 0.5 * (right - left), at, sigma, amplitude, weights, slope)
+    start = 0.5 * (right - left)
+    missed = 0.5 * start * start / (sigma * sigma + SMOOTHING)  # the highest pixel is beside the crest
+    amplitude = height * gains[at] * (1 + missed * (1 + 0.5 * missed))
+    column = _refine(window, top + start, at, sigma, amplitude, weights, slope)
     out[COLUMN] = column
     out[WIDTH] = FWHM * sigma + width - at / PER_PX
     out[AMPLITUDE] = amplitude
-    out[SIGMA] = noise * math.sqrt(SIGMA_FACTOR * sigma) / amplitude
+    out[SIGMA] = noise * spreads[at] / amplitude
     return not math.isnan(column)
 
 
 @compiled
-def _continued(row: Pixels, start: int, edge: Pixels) -> None:
+def _cut(row: Pixels, start: int, window: Pixels) -> None:
     """Copy a window of the row, continued by the border's pixel outside the image."""
-    for i in range(WINDOW):
-        edge[i] = row[min(max(start + i, 0), len(row) - 1)]
+    if start >= 0 and start + WINDOW <= len(row):
+        inside = row[start : start + WINDOW]
+        for i in range(WINDOW):
+            window[i] = inside[i]
+    else:
+        for i in range(WINDOW):
+            window[i] = row[min(max(start + i, 0), len(row) - 1)]
 
 
 @compiled
@@ -303,13 +309,16 @@ def _search(
     slope: Values,
     sigmas: Values,
     gains: Values,
+    spreads: Values,
     response: Pixels,
-    edge: Pixels,
+    window: Pixels,
     taken: NDArray[np.uint32],
+    values: Values,
+    y: int,
     out: Values,
 ) -> None:
     """Best first: the block of the largest bound is looked into until a known response is the largest."""
-    wanted = out.shape[0]
+    wanted = out.shape[2]
     found = 0
     gone = 0
     lowest = np.uint32(np.uint32(threshold) << np.uint32(16))
@@ -333,24 +342,24 @@ def _search(
             value = np.uint32(strongest >> np.uint32(8))
             order[k] = np.uint32(value << np.uint32(16)) | EXACT | np.uint32(place << np.uint32(8)) | np.uint32(k)
             continue
-        at = k * BLOCK + np.int64(np.uint32(best >> np.uint32(8)) & np.uint32(BLOCK - 1))
-        start = int(2 * at + 1 - MIDDLE)
-        result = out[found]
-        if start >= 0 and start + WINDOW <= len(row):
-            good = _measure(row[start : start + WINDOW], noise, full, weights, slope, sigmas, gains, result)
-        else:
-            _continued(row, start, edge)
-            good = _measure(edge, noise, full, weights, slope, sigmas, gains, result)
-        result[COLUMN] += start
-        if good and 0 <= result[COLUMN] <= len(row) - 1:
-            found += 1
-        else:
+        at = int(k * BLOCK + np.int64(np.uint32(best >> np.uint32(8)) & np.uint32(BLOCK - 1)))
+        start = 2 * at + 1 - MIDDLE
+        _cut(row, start, window)
+        good = _measure(window, noise, full, weights, slope, sigmas, gains, spreads, values)
+        values[COLUMN] += start
+        if good and 0 <= values[COLUMN] <= len(row) - 1:
             for i in range(RESULTS):
-                result[i] = np.nan
+                out[i, y, found] = values[i]
+            found += 1
+            if found == wanted:
+                return
         taken[gone] = at
         gone += 1
-        for i in range(max((at - FLANK) // BLOCK, 0), min((at + FLANK) // BLOCK + 1, len(order))):
+        for i in range(max(at - FLANK, 0) >> BLOCK_BITS, min((at + FLANK) >> BLOCK_BITS, len(order) - 1) + 1):
             order[i] = bounds[i] if i != k else np.uint32(np.uint32(best & np.uint32(0xFFFF0000)) | np.uint32(i))
+    for k in range(found, wanted):
+        for i in range(RESULTS):
+            out[i, y, k] = np.nan
 
 
 @compiled
@@ -361,6 +370,7 @@ def extract_rows(
     tail: Words,
     notes: NDArray[np.uint32],
     floors: NDArray[np.int32],
+    values: Values,
     full: float,
     threshold_sigmas: float,
     threshold_dn: float,
@@ -368,10 +378,11 @@ def extract_rows(
     slope: Values,
     sigmas: Values,
     gains: Values,
+    spreads: Values,
     out: Values,
     noise: Values,
 ) -> None:
-    """Fill `out` (rows, candidates, RESULTS), nan before, and `noise` (rows,).
+    """Fill `out` (RESULTS, rows, candidates) and `noise` (rows,).
 
     `words` holds the frame two pixels at a time; `scratch` gives the memory to work in. Noise and background are
     taken from two of each ROWS rows.
@@ -383,7 +394,7 @@ def extract_rows(
     used = ROWS * stride
     high = pixels[used : used + ROWS * blocks]
     response = pixels[used + ROWS * blocks :][:BLOCK]
-    edge = pixels[used + ROWS * blocks + BLOCK :]
+    window = pixels[used + ROWS * blocks + BLOCK :]
     bounds = notes[:blocks]
     order = notes[blocks : 2 * blocks]
     taken = notes[2 * blocks :]
@@ -420,12 +431,12 @@ def extract_rows(
                 order[k] = bounds[k]
             _search(
                 frame[first + y], padded, bounds, order, threshold, sigma, full,
-                weights, slope, sigmas, gains, response, edge, taken, out[first + y],
+                weights, slope, sigmas, gains, spreads, response, window, taken, values, first + y, out,
             )  # fmt: skip
 
 
-def scratch(words: Words, candidates: int) -> tuple[Pixels, Words, NDArray[np.uint32], NDArray[np.int32]]:
-    """Memory that the kernel works in: pixels, one block of words, notes and floors."""
+def scratch(words: Words, candidates: int) -> tuple[Pixels, Words, NDArray[np.uint32], NDArray[np.int32], Values]:
+    """Memory that the kernel works in: pixels, one block of words, notes, floors and one peak."""
     blocks = -(-words.shape[1] // BLOCK)
     pixel = np.uint8 if words.dtype == np.uint16 else np.uint16
     return (
@@ -433,4 +444,5 @@ def scratch(words: Words, candidates: int) -> tuple[Pixels, Words, NDArray[np.ui
         np.empty(BLOCK, words.dtype),
         np.empty(2 * blocks + candidates + REJECTED, np.uint32),
         np.empty(2 * blocks, np.int32),
+        np.empty(RESULTS, np.float64),
     )

@@ -11,15 +11,23 @@ from typing import Any, ParamSpec, TypeVar, cast
 
 import numpy as np
 from numba import njit, types
+from numba.core.registry import cpu_target
 from numba.extending import overload
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
+# Numba readies itself at the first compiled call, for a quarter of a second: here it does so at import.
+cast(Any, cpu_target.typing_context).refresh()
+cast(Any, cpu_target.target_context).refresh()
+
 
 def compiled(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a function of the kernel: views of arrays are not counted, so it can neither allocate nor return any."""
-    options = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": False}
+    """Compile a function of the kernel, into its caller.
+
+    Views of arrays are not counted, so it can neither allocate nor return any.
+    """
+    options = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": False, "forceinline": True}
     return cast(Any, njit)(**options)(function)
 
 

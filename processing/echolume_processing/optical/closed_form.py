@@ -81,3 +81,17 @@ def plane_from_pixel(centre: Points, ray_matrix: Matrix, normal: Points, distanc
         for i in range(3):
             out[i, k] = centre[i] * out[3, k] + (distance - along) * ray_matrix[i, k]
     return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def active_block(m: Matrix, px: Points, out: Points) -> None:
+    """Fill `out` (3, n) with the active points of image points (2, n); see `triangulate.active_columns`."""
+    # Into names first: the compiler cannot know that the loop's results do not change them.
+    m00, m01, m02, m10, m11, m12 = m[0, 0], m[0, 1], m[0, 2], m[1, 0], m[1, 1], m[1, 2]
+    m20, m21, m22, m30, m31, m32 = m[2, 0], m[2, 1], m[2, 2], m[3, 0], m[3, 1], m[3, 2]
+    for i in range(px.shape[1]):
+        u, v = px[0, i], px[1, i]
+        scale = 1.0 / (m30 * u + m31 * v + m32)
+        out[0, i] = (m00 * u + m01 * v + m02) * scale
+        out[1, i] = (m10 * u + m11 * v + m12) * scale
+        out[2, i] = (m20 * u + m21 * v + m22) * scale

@@ -33,14 +33,14 @@ class Match(NamedTuple):
     """Variance of that point along the line, over the variance of the partner's column; (n,)."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _usual(
-    points: Values, expected: Values, start: Indices, other: Values, f: Matrix, tolerance: float,
-    partner: Indices, match: Values, off: Values, gain: Values,
-) -> None:  # fmt: skip
+    points: Values, expected: Values, start: Indices, other: Values, f: Matrix, tolerance: float, found: Values
+) -> None:
     """Try the strongest candidates of the predicted row and of the next: nearly always they are it.
 
-    The loop has no branches, so that the compiler takes several candidates at once.
+    Fills `found` (5, n): partner, point u, v, distance from the prediction, gain. The loop has neither branches nor
+    more than one result, so that the compiler takes several candidates at once.
     """
     last_row, last = len(start) - 3, other.shape[1] - 1
     f00, f01, f02, f10, f11, f12 = f[0, 0], f[0, 1], f[0, 2], f[1, 0], f[1, 1], f[1, 2]
@@ -51,10 +51,11 @@ def _usual(
         at = np.int64(row if inside else 0.0)
         # Unsigned: an index that may be negative would be tested.
         first, second, third = start[np.uint64(at)], start[np.uint64(at + 1)], start[np.uint64(at + 2)]
-        i, j = np.uint64(min(first, last)), np.uint64(min(second, last))
+        i, j = min(first, last), min(second, last)
         u, v = points[0, n], points[1, n]
         a, b, c = f00 * u + f01 * v + f02, f10 * u + f11 * v + f12, f20 * u + f21 * v + f22
-        ua, va, ub, vb = other[0, i], other[1, i], other[0, j], other[1, j]
+        ua, va = other[0, np.uint64(i)], other[1, np.uint64(i)]
+        ub, vb = other[0, np.uint64(j)], other[1, np.uint64(j)]
         ea, eb = a * ua + b * va + c, a * ub + b * vb + c
         scale = 1.0 / (ea - eb)
         part = ea * scale
@@ -62,11 +63,11 @@ def _usual(
         slant = 1.0 + a * (ub - ua) * scale
         good = inside & (first < second) & (second < third) & (ea * eb <= 0.0)
         good &= (abs(ub - ua) < MAX_STEP_PX) & (abs(mu - column) < tolerance)
-        partner[n] = (min(first, last) if part < 0.5 else min(second, last)) if good else -1
-        match[0, n] = mu if good else np.nan
-        match[1, n] = va + part * (vb - va) if good else np.nan
-        off[n] = mu - column if good else np.nan
-        gain[n] = slant * slant * (1.0 - 2.0 * part * (1.0 - part)) if good else np.nan
+        found[0, n] = (float(i) if part < 0.5 else float(j)) if good else -1.0
+        found[1, n] = mu if good else np.nan
+        found[2, n] = va + part * (vb - va) if good else np.nan
+        found[3, n] = mu - column if good else np.nan
+        found[4, n] = slant * slant * (1.0 - 2.0 * part * (1.0 - part)) if good else np.nan
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -116,14 +117,15 @@ def _others(
 @njit(cache=True, nogil=True)
 def walk(side: Candidates, other: Candidates, f: Matrix, tolerance: float) -> Match:
     """See `correspond.walk`."""
-    n, m = len(side.row), len(other.row)
-    partner, match, off, gain = np.empty(n, np.int64), np.empty((2, n)), np.empty(n), np.empty(n)
-    if m == 0 or len(other.start) < 3:
+    n = len(side.row)
+    partner, found = np.empty(n, np.int64), np.empty((5, n))
+    if len(other.row) == 0 or len(other.start) < 3:
         partner[:] = -1
-        match[:] = np.nan
-        off[:] = np.nan
-        gain[:] = np.nan
-        return Match(partner, match, off, gain)
-    _usual(side.points_px, side.expected_px, other.start, other.points_px, f, tolerance, partner, match, off, gain)
+        found[:] = np.nan
+        return Match(partner, found[1:3], found[3], found[4])
+    _usual(side.points_px, side.expected_px, other.start, other.points_px, f, tolerance, found)
+    for i in range(n):
+        partner[i] = np.int64(found[0, i])
+    match, off, gain = found[1:3], found[3], found[4]
     _others(side.points_px, side.expected_px, other.start, other.points_px, f, tolerance, partner, match, off, gain)
     return Match(partner, match, off, gain)

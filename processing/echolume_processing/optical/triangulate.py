@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from echolume_messages.geometry import Matrix, Points3, require_shape
 from echolume_processing.optical import closed_form
-from echolume_processing.optical.closed_form import active_points, stereo_block, stereo_points
+from echolume_processing.optical.closed_form import active_block, active_points, stereo_block, stereo_points
 
 Points2 = NDArray[np.float64]
 
@@ -206,6 +206,15 @@ def active(plane: Matrix, points_px: Points2) -> Points3:
     require_shape("points_px", points_px, (None, 2))
     out = np.empty((len(points_px), 3))
     active_points(np.ascontiguousarray(plane), np.ascontiguousarray(points_px), out)
+    return out
+
+
+def active_columns(plane: Matrix, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Active points (3, n) of image points (2, n); see `active`."""
+    require_shape("plane", plane, (4, 3))
+    require_shape("points_px", points_px, (2, None))
+    out = np.empty((3, points_px.shape[1]))
+    active_block(np.ascontiguousarray(plane), np.ascontiguousarray(points_px), out)
     return out
 
 

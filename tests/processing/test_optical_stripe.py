@@ -219,6 +219,20 @@ def test_clutter_hides_few_rows_from_the_line_through_the_candidates() -> None:
     assert np.mean(~(np.abs(line - columns) <= 2)) < 0.1 * usual
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_frames_of_anything_give_finite_candidates_inside_the_frame_or_none(dtype: type) -> None:
+    rng = np.random.default_rng(9)
+    full = 255 if dtype is np.uint8 else 4095
+    for scale in (1, 4, 16, 60):
+        coarse = rng.integers(0, full + 1, (40, 200 // scale + 2))
+        found = extract(np.repeat(coarse, scale, axis=1)[:, :201].astype(dtype), 4)
+        seen = np.isfinite(found.column_px)
+        assert ((found.column_px[seen] >= 0) & (found.column_px[seen] <= 200)).all()
+        for values in (found.width_px, found.amplitude_dn, found.sigma_px):
+            assert (np.isfinite(values) == seen).all()
+            assert (values[seen] > 0).all()
+
+
 def test_speckle_is_part_of_each_sigma() -> None:
     frame = gaussian_rows(random_columns(), 2.0, noise=5.0)
     plain, grainy = extract(frame, 1), extract(frame, 1, speckle_px=0.1)

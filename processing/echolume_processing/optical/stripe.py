@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from echolume_messages.geometry import require_shape
 from echolume_processing.optical import stripe_kernel as kernel
 from echolume_processing.optical.stripe_filters import filters
-from echolume_processing.optical.stripe_kernel import FLANK_PX
+from echolume_processing.optical.stripe_measure import AMPLITUDE, COLUMN, FLANK_PX, RESULTS, SATURATED, SIGMA, WIDTH
 
 __all__ = ["CANDIDATES", "FLANK_PX", "Stripe", "extract", "speckle_sigma_px", "warm_up"]
 
@@ -164,7 +164,7 @@ def extract(
     rows = len(frame) if axis == 1 else frame.shape[1]
     full = float((1 << used) - 1)
     table = filters()
-    out = np.empty((kernel.RESULTS, rows, candidates))
+    out = np.empty((RESULTS, rows, candidates))
     noise = np.full(rows, kernel.MIN_NOISE_DN)
     if not pixels.size:
         out.fill(np.nan)
@@ -174,12 +174,12 @@ def extract(
             full * SATURATED_PART, RESPONSE_SIGMAS, full * MIN_RESPONSE_PART,
             *table, out, noise,
         )  # fmt: skip
-    sigma = out[kernel.SIGMA]
+    sigma = out[SIGMA]
     return Stripe(
-        out[kernel.COLUMN],
-        out[kernel.WIDTH],
-        out[kernel.AMPLITUDE],
-        out[kernel.SATURATED] == 1.0,
+        out[COLUMN],
+        out[WIDTH],
+        out[AMPLITUDE],
+        out[SATURATED] == 1.0,
         noise,
         np.hypot(sigma, speckle_px) if speckle_px else sigma,
     )

@@ -105,9 +105,7 @@ def pair_covariance(found: PairSolution, views: Sequence[BoardView], board: Cali
         scale = 1 / np.sqrt(np.diag(kept))  # focal lengths and distortions differ by many orders of magnitude
     scaled = kept * np.outer(scale, scale)
     if not np.isfinite(scaled).all() or float(np.linalg.cond(scaled)) > WORST_CONDITION:
-        raise CalibrationRejectedError(
-            f"calibrate cameras: rejected: the views do not determine the cameras: {ADVICE}"
-        )
+        raise CalibrationRejectedError(f"calibrate cameras: rejected: the views do not determine the cameras: {ADVICE}")
     out = np.zeros((total, total))
     out[np.ix_(free, free)] = variance * scale[:, None] * np.linalg.inv(scaled) * scale
     return PairCovariance(out, float(np.sqrt(variance)))

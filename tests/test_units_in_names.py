@@ -15,7 +15,9 @@ NUMBERS = {"float", "float | None", "tuple[float, float]", "tuple[float, float, 
 
 DIMENSIONLESS = {
     "amount": "share of what a filter takes away",
+    "contrast": "of speckle, 0 to 1",
     "dip": "share of a lobe's height",
+    "f_number": "focal length over aperture",
     "max_chi_squared": "per degree of freedom",
     "origin": "sample of a template, may lie between two",
     "reach": "share of a board's square",
@@ -32,7 +34,15 @@ DIMENSIONLESS = {
 OTHERWISE_SAID = {"wavenumber": "rad/mm, in the module's first lines", "position": "whatever an axis moves in"}
 
 # Inner loops in the notation of their formulas; the functions around them take names with units.
-KERNELS = ("kernels.py", "kirchhoff.py", "triangulate.py:stereo_point", "scipy_typed.py")
+KERNELS = (
+    "kernels.py",
+    "kirchhoff.py",
+    "closed_form.py",
+    "covariance.py",
+    "stripe_kernel.py",
+    "stripe_measure.py",
+    "scipy_typed.py",
+)
 
 
 def functions(body: list[ast.stmt]) -> Iterator[ast.FunctionDef]:

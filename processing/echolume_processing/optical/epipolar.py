@@ -35,7 +35,7 @@ class Match(NamedTuple):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _usual(
-    points: Values, expected: Values, start: Indices, other: Values, f: Matrix, tolerance: float, found: Values
+    points: Values, expected: Values, start: Indices, other: Values, f: Matrix, tolerance_px: float, found: Values
 ) -> None:
     """Try the strongest candidates of the predicted row and of the next: nearly always they are it.
 
@@ -62,7 +62,7 @@ def _usual(
         mu = ua + part * (ub - ua)
         slant = 1.0 + a * (ub - ua) * scale
         good = inside & (first < second) & (second < third) & (ea * eb <= 0.0)
-        good &= (abs(ub - ua) < MAX_STEP_PX) & (abs(mu - column) < tolerance)
+        good &= (abs(ub - ua) < MAX_STEP_PX) & (abs(mu - column) < tolerance_px)
         found[0, n] = (float(i) if part < 0.5 else float(j)) if good else -1.0
         found[1, n] = mu if good else np.nan
         found[2, n] = va + part * (vb - va) if good else np.nan
@@ -72,7 +72,7 @@ def _usual(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _others(
-    points: Values, expected: Values, start: Indices, other: Values, f: Matrix, tolerance: float,
+    points: Values, expected: Values, start: Indices, other: Values, f: Matrix, tolerance_px: float,
     partner: Indices, match: Values, off: Values, gain: Values,
 ) -> None:  # fmt: skip
     """Try all candidates of the rows around the predicted one, for those that have no partner yet."""
@@ -85,7 +85,7 @@ def _others(
         a = f[0, 0] * u + f[0, 1] * v + f[0, 2]
         b = f[1, 0] * u + f[1, 1] * v + f[1, 2]
         c = f[2, 0] * u + f[2, 1] * v + f[2, 2]
-        best = tolerance
+        best = tolerance_px
         for step in range(2 * REACH_ROWS + 1):
             # 0, 1, -1, 2, -2, ...
             at = int(np.floor(row)) + ((step + 1) // 2 if step % 2 else -(step // 2))
@@ -93,7 +93,7 @@ def _others(
                 continue
             for i in range(start[at], start[at + 1]):
                 ua, va = other[0, i], other[1, i]
-                if not abs(ua - column) < tolerance + MAX_STEP_PX:
+                if not abs(ua - column) < tolerance_px + MAX_STEP_PX:
                     continue
                 ea = a * ua + b * va + c
                 for j in range(start[at + 1], start[at + 2]):
@@ -115,7 +115,7 @@ def _others(
 
 
 @njit(cache=True, nogil=True)
-def walk(side: Candidates, other: Candidates, f: Matrix, tolerance: float) -> Match:
+def walk(side: Candidates, other: Candidates, f: Matrix, tolerance_px: float) -> Match:
     """See `correspond.walk`."""
     n = len(side.row)
     partner, found = np.empty(n, np.int64), np.empty((5, n))
@@ -123,9 +123,9 @@ def walk(side: Candidates, other: Candidates, f: Matrix, tolerance: float) -> Ma
         partner[:] = -1
         found[:] = np.nan
         return Match(partner, found[1:3], found[3], found[4])
-    _usual(side.points_px, side.expected_px, other.start, other.points_px, f, tolerance, found)
+    _usual(side.points_px, side.expected_px, other.start, other.points_px, f, tolerance_px, found)
     for i in range(n):
         partner[i] = np.int64(found[0, i])
     match, off, gain = found[1:3], found[3], found[4]
-    _others(side.points_px, side.expected_px, other.start, other.points_px, f, tolerance, partner, match, off, gain)
+    _others(side.points_px, side.expected_px, other.start, other.points_px, f, tolerance_px, partner, match, off, gain)
     return Match(partner, match, off, gain)

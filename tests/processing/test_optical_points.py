@@ -1,0 +1,257 @@
+"""Joint triangulation, covariances, correspondence, verdicts: known answers, Monte Carlo, NEES of emulated stripes."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+
+from echolume_drivers.emulated.optics import optical_truth
+from echolume_drivers.emulated.scene import Material, SceneBuilder, matte, plate
+from echolume_drivers.emulated.stripe_image import render_stripe, true_stripe
+from echolume_messages.calibration import CameraCalibration
+from echolume_messages.types import Frame, OpticalSource
+from echolume_processing.optical import covariance, triangulate
+from echolume_processing.optical.camera import Camera
+from echolume_processing.optical.candidates import Candidates, candidates_of, view_of
+from echolume_processing.optical.correspond import walk
+from echolume_processing.optical.pipeline import OpticalPipeline, OpticalSettings
+from echolume_processing.optical.select import Verdict
+from echolume_processing.optical.stripe import extract
+from processing.test_optical_pipeline import camera_of, laser_of
+
+TRUTH = optical_truth(1)
+CAMERAS = tuple(Camera(c.matrix, c.distortion, c.camera_from_rig) for c in (TRUTH.left, TRUTH.right))
+M = CAMERAS[0].projection, CAMERAS[1].projection
+VIEWS = view_of(CAMERAS[0], CAMERAS[1]), view_of(CAMERAS[1], CAMERAS[0])
+NORMAL, DISTANCE_MM = TRUTH.laser_normal, 12.0
+GATES_MM = np.array([-8.0, 80.0, -130.0, 130.0])
+
+
+def plane_points(n: int) -> np.ndarray:
+    """Points (n, 3) of the laser plane within the field."""
+    points = np.random.default_rng(0).uniform([0, -90, 0], [0, 90, 40], (n, 3))
+    return points - np.outer(points @ NORMAL - DISTANCE_MM, NORMAL)
+
+
+def columns_of(points: np.ndarray) -> np.ndarray:
+    """Undistorted image points (4, n): u, v of the left camera, then of the right."""
+    return np.concatenate([camera.undistort(camera.project(points)).T for camera in CAMERAS])
+
+
+def pair(scene: object, x_mm: float, seed: int = 0) -> list[Frame]:
+    rng = np.random.default_rng(seed)
+    return [render_stripe(scene, TRUTH, side, x_mm, rng, 4e-3, True) for side in ("left", "right")]
+
+
+@pytest.fixture(scope="module")
+def pipeline() -> OpticalPipeline:
+    return OpticalPipeline.of(camera_of(TRUTH.left), camera_of(TRUTH.right), laser_of())
+
+
+def test_both_layouts_of_the_closed_forms_agree() -> None:
+    seen = columns_of(plane_points(300)) + np.random.default_rng(1).normal(0, 0.1, (4, 300))
+    rows = triangulate.stereo(*M, np.ascontiguousarray(seen[:2].T), np.ascontiguousarray(seen[2:].T))
+    assert np.allclose(triangulate.stereo_columns(*M, seen), rows.T, atol=1e-9)
+    plane = triangulate.plane_from_pixel(CAMERAS[1].centre_mm, CAMERAS[1].ray_matrix, NORMAL, DISTANCE_MM)
+    rows = triangulate.active(plane, np.ascontiguousarray(seen[2:].T))
+    assert np.allclose(triangulate.active_columns(plane, seen[2:]), rows.T, atol=1e-9)
+    assert np.abs(rows @ NORMAL - DISTANCE_MM).max() < 1e-9
+
+
+def test_with_a_hard_plane_joint_points_lie_on_it_and_z_is_the_weighted_mean_of_both_cameras() -> None:
+    points = plane_points(300)
+    seen = columns_of(points)
+    seen[0] += np.random.default_rng(2).normal(0, 0.05, 300)
+    seen[2] += np.random.default_rng(3).normal(0, 0.2, 300)
+    stereo = triangulate.stereo_columns(*M, seen)
+    own = covariance.stereo_covariance(*M, stereo, np.full(300, 0.05), np.full(300, 0.2), 1e-4)
+    drawn, after = covariance.joint(stereo, own, NORMAL, DISTANCE_MM, 0.0)
+    assert np.abs(NORMAL @ drawn - DISTANCE_MM).max() < 1e-10
+    assert np.abs(np.einsum("i,ijn->jn", NORMAL, np.moveaxis(covariance.full(after), 0, 2))).max() < 1e-12
+    planes = [triangulate.plane_from_pixel(v.centre_mm, v.ray_matrix, NORMAL, DISTANCE_MM) for v in VIEWS]
+    left_z, right_z = (triangulate.active_columns(planes[i], seen[2 * i : 2 * i + 2])[2] for i in (0, 1))
+    variances = [
+        covariance.active_covariance(M[i], NORMAL, stereo, np.full(300, s), 1e-4, 0.0)[5]
+        for i, s in enumerate((0.05, 0.2))
+    ]
+    mean_z = (left_z / variances[0] + right_z / variances[1]) / (1 / variances[0] + 1 / variances[1])
+    assert np.allclose(drawn[2], mean_z, atol=2e-3)
+    assert np.std(drawn[2] - points[:, 2]) < 0.5 * np.std(stereo[2] - points[:, 2])
+
+
+def test_a_plane_known_to_nothing_leaves_stereo_points_where_they_are() -> None:
+    points = plane_points(50).T
+    own = covariance.stereo_covariance(*M, points, np.full(50, 0.1), np.full(50, 0.1), 0.01)
+    drawn, after = covariance.joint(points + 0.3, own, NORMAL, DISTANCE_MM, 1e4)
+    assert np.allclose(drawn, points + 0.3, atol=1e-6)
+    assert np.allclose(after, own, rtol=1e-6)
+
+
+def test_covariances_are_those_of_ten_thousand_draws() -> None:
+    n, rng = 20_000, np.random.default_rng(4)
+    point = np.array([[DISTANCE_MM, 55.0, 21.0]])
+    point -= (point @ NORMAL - DISTANCE_MM)[:, None] * NORMAL
+    exact = np.repeat(columns_of(point), n, axis=1)
+    sigma_left, sigma_right, sigma_v, sigma_plane = 0.08, 0.15, 0.03, 0.04
+    left = exact[:2] + rng.normal(0, 1, (2, n)) * [[sigma_left], [sigma_v]]
+    right_column = exact[2] + rng.normal(0, sigma_right, n)
+    # The right point lies on the left one's epipolar line, as the walk finds it.
+    line = VIEWS[0].f_to_other @ np.vstack([left, np.ones(n)])
+    right_row = -(line[0] * right_column + line[2]) / line[1]
+    stereo = triangulate.stereo_columns(*M, np.vstack([left, right_column, right_row]))
+    centre = VIEWS[0].centre_mm
+    slant = VIEWS[0].ray_matrix @ np.vstack([left, np.ones(n)])
+    shifted = DISTANCE_MM + rng.normal(0, sigma_plane, n)
+    active = centre[:, None] + (shifted - NORMAL @ centre) / (NORMAL @ slant) * slant
+    stated = (
+        covariance.stereo_covariance(*M, point.T, np.array([sigma_left]), np.array([sigma_right]), sigma_v),
+        covariance.active_covariance(M[0], NORMAL, point.T, np.array([sigma_left]), sigma_v, sigma_plane),
+    )
+    for drawn, own in zip((stereo, active), stated, strict=True):
+        expected = covariance.full(own)[0]
+        scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+        assert np.abs((np.cov(drawn) - expected) / scale).max() < 0.04
+
+
+def test_joint_covariance_is_smaller_than_either() -> None:
+    points = plane_points(40).T
+    sigma = np.full(40, 0.1)
+    own = covariance.stereo_covariance(*M, points, sigma, sigma, 0.01)
+    _, both = covariance.joint(points, own, NORMAL, DISTANCE_MM, 0.03)
+    active = covariance.active_covariance(M[0], NORMAL, points, sigma, 0.01, 0.03)
+    for larger in (own, active):
+        assert np.linalg.eigvalsh(covariance.full(larger) - covariance.full(both)).min() > -1e-12
+
+
+def moved(camera: CameraCalibration, u_px: float, v_px: float) -> CameraCalibration:
+    """A calibration whose image centre is off."""
+    rows = [list(row) for row in camera.camera_matrix]
+    rows[0][2] += u_px
+    rows[1][2] += v_px
+    return msgspec.structs.replace(camera, camera_matrix=rows, rms_px=0.04)
+
+
+def test_covariances_of_emulated_stripes_are_honest() -> None:
+    """Planes are 0.02 mm and cameras 0.01 px off, otherwise for each stripe; NEES averages to one."""
+    off_mm = 0.02 * np.random.default_rng(0).choice([-1, 1], 8)
+    off_px = 0.01 * np.random.default_rng(1).choice([-1, 1], (8, 4))
+    nees = []
+    for i, x_mm in enumerate(np.linspace(-90, 90, 8)):
+        scene = (matte, plate)[i % 2]()
+        left, right = moved(camera_of(TRUTH.left), *off_px[i, :2]), moved(camera_of(TRUTH.right), *off_px[i, 2:])
+        pipeline = OpticalPipeline.of(left, right, laser_of(), OpticalSettings(plane_sigma_mm=0.02))
+        seen = pipeline.measure(*pair(scene, x_mm, i), x_mm + off_mm[i])
+        column = true_stripe(scene, TRUTH, "left", x_mm).rows(1024)
+        plane = triangulate.plane_from_pixel(
+            VIEWS[0].centre_mm, VIEWS[0].ray_matrix, NORMAL, TRUTH.plane_offset_mm(x_mm)
+        )
+        lit = triangulate.active(plane, CAMERAS[0].undistort(np.column_stack([column, np.arange(1024.0)])))
+        edge = np.any([np.abs(np.roll(lit[:, 2], k) - lit[:, 2]) >= 1 for k in range(-6, 7)], axis=0)
+        chosen = seen.points["source"] != OpticalSource.ACTIVE_RIGHT
+        mine = seen.points[chosen]
+        off = np.column_stack([mine[a] for a in ("x_mm", "y_mm", "z_mm")]) - lit[mine["row"]]
+        known = np.isfinite(off[:, 0]) & ~edge[mine["row"]]
+        nees.append(np.einsum("ni,nij,nj->n", off[known], np.linalg.inv(seen.matrices[chosen][known]), off[known]) / 3)
+    assert 0.8 < np.concatenate(nees).mean() < 1.25
+
+
+def sides_of(frames: list[Frame], x_mm: float) -> list[Candidates]:
+    distance_mm = TRUTH.plane_offset_mm(x_mm)
+    return [
+        candidates_of(extract(frames[i]), VIEWS[i], VIEWS[1 - i], NORMAL, distance_mm, GATES_MM) for i in (0, 1)
+    ]  # fmt: skip
+
+
+def test_candidates_lie_on_the_plane_and_where_the_other_camera_sees_them() -> None:
+    left, right = sides_of(pair(plate(20.0), 5.0), 5.0)
+    known = np.isfinite(left.active_mm[2])
+    points = left.active_mm[:, known].T
+    assert np.abs(points @ NORMAL - TRUTH.plane_offset_mm(5.0)).max() < 1e-9
+    expected = CAMERAS[1].project(points)
+    assert np.abs(left.expected_px[1, known] - expected[:, 1]).max() < 1e-6
+    assert np.abs(left.expected_px[0, known] - CAMERAS[1].undistort(expected)[:, 0]).max() < 1e-6
+    assert np.array_equal(np.repeat(np.arange(1024), np.diff(left.start)), left.row)
+    assert np.isfinite(right.active_mm[2]).sum() > 900
+
+
+def test_matched_points_lie_on_the_epipolar_line_and_close_to_where_the_plane_predicts_them() -> None:
+    left, right = sides_of(pair(plate(20.0), 5.0), 5.0)
+    found = walk(left, right, VIEWS[0].f_to_other)
+    known = found.partner >= 0
+    assert known.sum() > 900
+    lines = VIEWS[0].f_to_other @ np.vstack([left.points_px[:, known], np.ones(known.sum())])
+    distance = np.sum(lines * np.vstack([found.points_px[:, known], np.ones(known.sum())]), axis=0)
+    assert np.abs(distance / np.hypot(lines[0], lines[1])).max() < 1e-6
+    assert np.median(np.abs(found.off_px[known])) < 0.3
+    assert ((found.gain[known] > 0.4) & (found.gain[known] < 1.2)).all(), "two rows are better than one"
+    assert np.abs(right.row[found.partner[known]] - left.expected_px[1, known]).max() < 2
+
+
+def test_no_candidates_match_nothing() -> None:
+    left, right = sides_of([pair(plate(), 0.0)[0], np.full((1024, 1280), 5, dtype=np.uint8)], 0.0)
+    assert (walk(left, right, VIEWS[0].f_to_other).partner == -1).all()
+    assert len(walk(right, left, VIEWS[1].f_to_other).partner) == len(right.row)
+
+
+def test_flags_tell_points_that_both_cameras_see(pipeline: OpticalPipeline) -> None:
+    scene = SceneBuilder("wall").box((10, 40), (-30, 30), 40.0).build()
+    seen = pipeline.measure(*pair(scene, 4.0), 4.0)
+    left = seen.points[seen.points["source"] == OpticalSource.ACTIVE_LEFT]
+    hidden = np.abs(left["y_mm"]) < 25
+    assert hidden.sum() > 100, "the wall hides the stripe from the right camera only"
+    assert not (left["flags"][hidden] & 2).any()
+    assert (left["flags"][(np.abs(left["y_mm"]) > 40) & (np.abs(left["y_mm"]) < 100)] & 2).all()
+    assert (seen.points["flags"][seen.points["source"] == OpticalSource.STEREO] & 2).all()
+    assert seen.counts["left"] == np.count_nonzero((left["flags"] & 2) == 0)
+    assert seen.counts["both"] > 500
+
+
+def false_stripe(frame: Frame, rows: slice, column: float, crest: float, sigma_px: float) -> Frame:
+    """The frame with one more stripe, upright."""
+    out = frame.astype(np.float64)
+    out[rows] += crest * np.exp(-0.5 * ((np.arange(frame.shape[1]) - column) / sigma_px) ** 2)
+    return np.clip(np.rint(out), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("rows", "crest", "sigma_px", "reason"),
+    [
+        (slice(400, 640), 40.0, 1.7, "weak"),
+        (slice(400, 640), 120.0, 5.0, "odd"),
+        (slice(500, 508), 120.0, 1.7, "short"),
+        (slice(60, 200), 120.0, 1.7, "secondary"),
+    ],
+)
+def test_a_false_stripe_in_one_camera_is_rejected_with_its_reason(
+    pipeline: OpticalPipeline, rows: slice, crest: float, sigma_px: float, reason: str
+) -> None:
+    scene = SceneBuilder("black").box((-60, 60), (-60, 60), 5.0, Material.BLACK).build()
+    left, right = pair(scene, 0.0)
+    before = pipeline.measure(left, right, 0.0)
+    middle = float(np.median(extract(left, 1).column_px[60:200, 0]))
+    after = pipeline.measure(false_stripe(left, rows, middle + 25.0, crest, sigma_px), right, 0.0)
+    assert after.counts[reason] - before.counts[reason] > 0.8 * len(range(*rows.indices(1024)))
+    assert after.counts["left"] == before.counts["left"]
+    assert abs(len(after.points) - len(before.points)) < 10
+
+
+def test_two_false_stripes_that_tell_different_heights_contradict_each_other(pipeline: OpticalPipeline) -> None:
+    scene = SceneBuilder("black").box((-60, 60), (-60, 60), 5.0, Material.BLACK).build()
+    left, right = pair(scene, 0.0)
+    own = [float(np.median(extract(f, 1).column_px[60:200, 0])) for f in (left, right)]
+    rows = slice(400, 640)
+    seen = pipeline.measure(
+        false_stripe(left, rows, own[0] + 25.0, 120.0, 1.7), false_stripe(right, rows, own[1] + 10.0, 120.0, 1.7), 0.0
+    )
+    assert seen.counts["contradicted"] > 400
+    assert seen.counts["left"] + seen.counts["right"] < 60
+
+
+def test_every_candidate_meets_one_verdict(pipeline: OpticalPipeline) -> None:
+    frames = pair(matte(), -40.0)
+    seen = pipeline.measure(*frames, -40.0)
+    for verdicts, side in zip(seen.verdicts, sides_of(frames, -40.0), strict=True):
+        assert verdicts.shape == (len(Verdict),)
+        assert verdicts.sum() == len(side.row)
+    assert seen.counts["both"] == seen.verdicts[0][Verdict.BOTH] > 900

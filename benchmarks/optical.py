@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 import cv2
+from comparison.points import points_rows
 from comparison.real_boards import calibration_rows
 from comparison.stripe import stripe_rows
 
@@ -18,7 +19,7 @@ def main() -> None:
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     figures: dict[str, float] = {}
-    for part in (stripe_rows, calibration_rows):
+    for part in (stripe_rows, points_rows, calibration_rows):
         figures |= part()
     if arguments.json is not None:
         arguments.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")

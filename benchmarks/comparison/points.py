@@ -284,7 +284,8 @@ def triangulation_rows(seconds: float) -> dict[str, float]:
     for name, answer in answers.items():
         rms = np.sqrt(np.mean((answer - points[: len(answer)]) ** 2, axis=0))
         print(f"{name:29}{spent.get(name, np.nan):11.1f}{rms[0]:10.4f}{rms[2]:8.4f}")
-    off = np.abs(answers["ST, echolume"][:few] - answers["ST, numpy eigh"]).max()
+    noisy = [np.ascontiguousarray(e[:few] + rng.normal(0, IMAGE_NOISE_PX, (few, 2))) for e in exact]
+    off = np.abs(triangulate.stereo(*m, *noisy) - triangulate.stereo_eigen(*m, *noisy)).max()
     return {
         "st_vs_cv2": spent["ST, cv2.triangulatePoints"] / spent["ST, echolume"],
         "st_eigh_diff_mm": float(off),

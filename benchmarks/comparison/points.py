@@ -32,8 +32,10 @@ POINTS = 20_000
 IMAGE_NOISE_PX = 0.1
 PAIRS = 9
 """Frame pairs that take turns: more than the processor's second cache holds, as in operation."""
-PLANE_SIGMA_MM, CAMERA_SIGMA_PX = 0.02, 0.01
-"""Errors that the emulated scans get, and that the covariances are told of."""
+GUIDE_SIGMA_MM, CAMERA_SIGMA_PX = 0.01, 0.01
+PLANE_SIGMAS = (0.015, 5e-5, 1e-4, 2e-4)
+"""Errors that the emulated scans get, and that the covariances are told of: of the plane's position, its advance along
+the guide, and its slopes in y and z."""
 EDGE_ROWS, EDGE_MM = 6, 1.0
 
 TARGETS: Mapping[str, tuple[float, float]] = {
@@ -276,7 +278,7 @@ def triangulation_rows(seconds: float) -> dict[str, float]:
         "AT, eq. 3-4 by batched solve": triangulate.active_x_plane(m[0], left, 10.0),
         "  its np.linalg.solve alone": np.linalg.solve(a, b)[:, [0, 0, 1], 0] * [0, 1, 1] + [10.0, 0, 0],
         "ST + AT, plane hard": joint(0.0),
-        "ST + AT, plane soft": joint(PLANE_SIGMA_MM),
+        "ST + AT, plane soft": joint(PLANE_SIGMAS[0]),
         "AT, plane off by 0.05 mm": triangulate.active(shifted, left),
     }
     print(f"\nTriangulation of {POINTS} points, columns {IMAGE_NOISE_PX} px of noise")
@@ -354,6 +356,24 @@ def _moved(camera: CameraCalibration, rng: np.random.Generator) -> CameraCalibra
     return msgspec.structs.replace(camera, camera_matrix=rows)
 
 
+def _tilted(truth: OpticalTruth, rng: np.random.Generator) -> LaserCalibration:
+    """A laser plane that is wrong by as much as its covariance says."""
+    exact = laser_of(truth)
+    n = np.array(exact.normal)
+    along = float(n @ np.array(exact.guide_direction))
+    off, advance, slope_y, slope_z = rng.normal(0, PLANE_SIGMAS)
+    moved = n - np.array([0.0, slope_y, slope_z])
+    size = float(np.linalg.norm(moved))
+    guide = (along + advance) / size * moved / size
+    return msgspec.structs.replace(
+        exact,
+        normal=tuple((moved / size).tolist()),
+        offset_mm=(exact.offset_mm + off) / size,
+        guide_direction=tuple(guide.tolist()),
+        plane_covariance=np.diag(np.square(PLANE_SIGMAS)).tolist(),
+    )
+
+
 def true_points(scene: Scene, truth: OpticalTruth, side: str, x_mm: float) -> np.ndarray:
     """The lit point (rows, 3) of each image row; nan where there is none, or near an edge."""
     camera = truth.camera(side)
@@ -372,16 +392,16 @@ def true_points(scene: Scene, truth: OpticalTruth, side: str, x_mm: float) -> np
 def nees_rows(seeds: range = range(1, 9), stripes: int = 10) -> dict[str, float]:
     """Squared errors over the stated covariances, over 3: 1 if the covariances are right."""
     found: dict[str, list[np.ndarray]] = {name: [] for name in ("ST", "AT-left", "AT-right", "ST + AT")}
-    settings = OpticalSettings(plane_sigma_mm=PLANE_SIGMA_MM, camera_sigma=CAMERA_SIGMA_PX / 0.04)
+    settings = OpticalSettings(camera_sigma=CAMERA_SIGMA_PX / 0.04)
     for seed in seeds:
         truth, rng = optical_truth(seed), np.random.default_rng([seed, 5])
         for i, x_mm in enumerate(rng.uniform(-95, 95, stripes)):
             scene = (matte, plate)[i % 2]()
             pipeline = OpticalPipeline.of(
-                _moved(camera_of(truth.left), rng), _moved(camera_of(truth.right), rng), laser_of(truth), settings
+                _moved(camera_of(truth.left), rng), _moved(camera_of(truth.right), rng), _tilted(truth, rng), settings
             )
             pair = [render_stripe(scene, truth, side, x_mm, rng, EXPOSURE_S, True) for side in SIDES]
-            seen = pipeline.measure(pair[0], pair[1], x_mm + rng.normal(0, PLANE_SIGMA_MM))
+            seen = pipeline.measure(pair[0], pair[1], x_mm + rng.normal(0, GUIDE_SIGMA_MM), GUIDE_SIGMA_MM)
             lit = {side: true_points(scene, truth, side, x_mm) for side in SIDES}
             xyz = np.column_stack([seen.points[axis] for axis in ("x_mm", "y_mm", "z_mm")]).astype(np.float64)
             row, source = seen.points["row"], seen.points["source"]
@@ -399,7 +419,8 @@ def nees_rows(seeds: range = range(1, 9), stripes: int = 10) -> dict[str, float]
                 off, own = off[known], matrices[chosen][known]
                 found[name].append(np.einsum("ni,nij,nj->n", off, np.linalg.inv(own), off) / 3)
     print(
-        f"\nNEES of the covariances; each stripe has its plane {PLANE_SIGMA_MM} mm and cameras {CAMERA_SIGMA_PX} px off"
+        f"\nNEES of the covariances; each stripe has its plane {PLANE_SIGMAS[0]} mm and tilted, its guide "
+        f"{GUIDE_SIGMA_MM} mm and its cameras {CAMERA_SIGMA_PX} px off"
     )
     means = {name: float(np.concatenate(values).mean()) for name, values in found.items()}
     print("".join(f"{name:>12} {mean:.3f}" for name, mean in means.items()))

@@ -114,7 +114,7 @@ def gather(archive: Path, progress: Progress = silent, start: ScanStart | None =
             left, right = (message, other) if message.topic == topics.CAMERA_LEFT else (other, message)
             frames = np.asarray(left.payload, dtype=np.uint8), np.asarray(right.payload, dtype=np.uint8)
             try:
-                evidence.add_optical(*key, optical.process(*frames, _guide_x_mm(left)))
+                evidence.add_optical(*key, optical.process(*frames, _guide_x_mm(left), left.header.source.sigma_mm))
             except ValueError as error:
                 log.warning("%s: trigger %d: the stripe is skipped: %s", archive, header.trigger, error)
                 continue

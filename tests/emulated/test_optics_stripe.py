@@ -270,3 +270,14 @@ def test_a_glossy_plate_shines_where_it_mirrors_the_laser_and_is_dim_elsewhere()
     middle, far = np.abs(stripe.points_mm[:, 1]) < 5, np.abs(stripe.points_mm[:, 1]) > 95
     assert ratio[middle].min() > 2
     assert ratio[far].max() < ratio[middle].min() / 1.5
+
+
+def test_the_carriage_stands_a_hundredth_of_a_millimetre_from_where_its_controller_believes_it() -> None:
+    here = [0.0]
+    stage = Stage(seed=1, scene=plate(), guide_x_mm=lambda: here[0])
+    errors_mm = []
+    for here[0] in np.arange(-100.0, 100.0, 0.5):
+        errors_mm.append(stage.carriage_mm() - here[0])
+        assert stage.carriage_mm() - here[0] == errors_mm[-1]
+    assert 0.0085 < np.std(errors_mm) < 0.0115
+    assert abs(np.mean(errors_mm)) < 0.002

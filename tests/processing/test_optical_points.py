@@ -140,7 +140,7 @@ def test_covariances_of_emulated_stripes_are_honest() -> None:
     for i, x_mm in enumerate(np.linspace(-90, 90, 8)):
         scene = (matte, plate)[i % 2]()
         left, right = moved(camera_of(TRUTH.left), *off_px[i, :2]), moved(camera_of(TRUTH.right), *off_px[i, 2:])
-        pipeline = OpticalPipeline.of(left, right, laser_of(), OpticalSettings(plane_sigma_mm=0.02))
+        pipeline = OpticalPipeline.of(left, right, laser_of(), OpticalSettings(plane_sigma_mm=0.02, guide_sigma_mm=0.0))
         seen = pipeline.measure(*pair(scene, x_mm, i), x_mm + off_mm[i])
         column = true_stripe(scene, TRUTH, "left", x_mm).rows(1024)
         plane = triangulate.plane_from_pixel(
@@ -154,6 +154,29 @@ def test_covariances_of_emulated_stripes_are_honest() -> None:
         known = np.isfinite(off[:, 0]) & ~edge[mine["row"]]
         nees.append(np.einsum("ni,nij,nj->n", off[known], np.linalg.inv(seen.matrices[chosen][known]), off[known]) / 3)
     assert 0.8 < np.concatenate(nees).mean() < 1.25
+
+
+def test_the_planes_covariance_enters_each_point_where_it_lies() -> None:
+    """Tilt about z is known badly: far from the middle of the line the active points are less sure, stereo is not."""
+    tilt = np.zeros((4, 4))
+    tilt[2, 2] = 1e-3**2
+    laser = msgspec.structs.replace(laser_of(), plane_covariance=tilt.tolist())
+    pipeline = OpticalPipeline.of(camera_of(TRUTH.left), camera_of(TRUTH.right), laser)
+    seen = pipeline.measure(*pair(plate(10.0), 5.0, 3), 5.0, 0.004)
+    plain = OpticalPipeline.of(camera_of(TRUTH.left), camera_of(TRUTH.right), laser_of()).measure(
+        *pair(plate(10.0), 5.0, 3), 5.0
+    )
+    assert np.array_equal(seen.points["z_mm"], plain.points["z_mm"])
+    stereo = seen.points["source"] == OpticalSource.STEREO
+    assert np.array_equal(seen.covariance[:, stereo], plain.covariance[:, stereo])
+    left = np.flatnonzero(seen.points["source"] == OpticalSource.ACTIVE_LEFT)
+    for k in (left[5], left[len(left) // 2], left[-5]):
+        place = [float(seen.points[axis][k]) for axis in ("x_mm", "y_mm", "z_mm")]
+        own_mm = laser.sigma_mm(5.0, place[1], place[2])
+        assert own_mm is not None
+        along = np.sqrt(NORMAL @ seen.matrices[k] @ NORMAL)
+        assert along == pytest.approx(np.hypot(own_mm, 0.004 * NORMAL @ TRUTH.guide_direction), rel=1e-3)
+    assert pipeline.plane_limit_mm == pytest.approx(0.04)
 
 
 def sides_of(frames: list[Frame], x_mm: float) -> list[Candidates]:

@@ -166,7 +166,7 @@ class CameraPeer:
         """A pulse on the trigger line; its width is the exposure. What it catches is fixed here and now."""
         with self.stage.lock:
             x_mm = float(self.stage.guide_x_mm())
-            caught = (x_mm, self.stage.laser_on, self.stage.scene, self.stage.board)
+            caught = (self.stage.carriage_mm(), self.stage.laser_on, self.stage.scene, self.stage.board)
         t_ns = time.monotonic_ns()
         with self._lock:
             if not self._acquiring or self._features["TriggerMode"] != "On" or self._shots.full():

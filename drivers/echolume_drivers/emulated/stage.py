@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 
 from echolume_drivers.emulated.scene import Scene
 
+SCREW_SIGMA_MM = 0.01
+"""How far the carriage stands from where the guide's controller believes it."""
+
 
 @dataclass(frozen=True)
 class Board:
@@ -56,13 +59,22 @@ class Stage:
             for callback in self._laser_watchers:
                 callback(on)
 
+    def carriage_mm(self) -> float:
+        """Where the guide's carriage really stands; the screw's error is the same at each return to a position."""
+        believed_mm = float(self.guide_x_mm())
+        return believed_mm + float(self._drawn("screw", round(1000 * believed_mm)).normal(0, SCREW_SIGMA_MM))
+
     def noise(self, device: str, position: NDArray[np.float64]) -> np.random.Generator:
         """Random numbers keyed by (seed, device, position to 1 um, attempt at that position)."""
         spot = tuple(int(v) for v in np.round(np.asarray(position, dtype=np.float64) * 1000))
         with self.lock:
             attempt = self._attempts.get((device, spot), 0)
             self._attempts[device, spot] = attempt + 1
-        text = repr((self.seed, device, spot, attempt)).encode()
+        return self._drawn(device, spot, attempt)
+
+    def _drawn(self, *key: object) -> np.random.Generator:
+        """Random numbers of this rig keyed by plain values."""
+        text = repr((self.seed, *key)).encode()
         return np.random.default_rng(int.from_bytes(hashlib.sha256(text).digest()[:8], "little"))
 
     def place(self, scene: Scene | None = None, board: Board | None = None) -> None:

@@ -26,8 +26,6 @@ class Terms(NamedTuple):
     """Lowest and highest z, lowest and highest y."""
     normal: Values
     """Of the laser plane."""
-    plane_mm: float
-    """Sigma of the laser plane's position."""
     left_px: float
     """Sigma of the left camera's model."""
     right_px: float
@@ -57,6 +55,20 @@ def _variance(side: Candidates, verdict: select.Verdicts) -> Values:
 
 
 @njit(cache=True, nogil=True)
+def _plane_variance(points: Values, plane_mm2: Values) -> Values:
+    """Variance of the laser plane's position at points (3, n), (n,)."""
+    out = np.empty(points.shape[1])
+    for i in range(len(out)):
+        y, z = points[1, i], points[2, i]
+        out[i] = (
+            plane_mm2[0]
+            + y * (plane_mm2[1] + y * plane_mm2[3] + z * plane_mm2[4])
+            + z * (plane_mm2[2] + z * plane_mm2[5])
+        )
+    return out
+
+
+@njit(cache=True, nogil=True)
 def _write(
     out: Structured, first: int, points: Values, cov: Values, row: NDArray[np.int64], flags: NDArray[np.uint8],
     source: int,
@@ -70,7 +82,7 @@ def _write(
 
 @njit(cache=True, nogil=True)
 def _active(
-    side: Candidates, verdict: select.Verdicts, variance: Values, view: View, terms: Terms, camera_px: float,
+    side: Candidates, verdict: select.Verdicts, variance: Values, view: View, plane_mm2: Values, camera_px: float,
     plane: Values, source: int, out: Structured, first: int,
 ) -> Values:  # fmt: skip
     """Write the active points of one camera; their covariance (6, n)."""
@@ -79,19 +91,17 @@ def _active(
         if verdict[k] <= select.LAST_BELIEVED:
             kept[n] = k
             n += 1
-    points, sigma, plane_mm = np.empty((3, n)), np.empty(n), np.empty(n)
+    points, sigma = np.empty((3, n)), np.empty(n)
     row, flags = np.empty(n, np.int64), np.empty(n, np.uint8)
     for i in range(n):
         k = kept[i]
         points[0, i], points[1, i], points[2, i] = side.active_mm[0, k], side.active_mm[1, k], side.active_mm[2, k]
         sigma[i] = np.sqrt(variance[k] + camera_px * camera_px)
-        plane_mm[i] = terms.plane_mm
         row[i] = side.row[k]
         flags[i] = SATURATED * side.saturated[k] + BOTH * (verdict[k] == 0)
     found = np.empty((6, n))
-    covariance.meet(
-        points, view.projection, plane, True, sigma, camera_px, plane_mm, found
-    )  # fmt: skip
+    plane_mm = np.sqrt(_plane_variance(points, plane_mm2))
+    covariance.meet(points, view.projection, plane, True, sigma, camera_px, plane_mm, found)
     _write(out, first, points, found, row, flags, source)
     return found
 
@@ -104,6 +114,7 @@ def run(
     right: View,
     terms: Terms,
     distance_mm: float,
+    plane_mm2: Values,
     out: Structured,
 ) -> Found:
     """Fill `out` with OPTICAL_POINTs: stereo, active left, active right; there are as many as covariances.
@@ -118,6 +129,8 @@ def run(
         Gates and error terms.
     distance_mm : float
         n.X of the laser plane.
+    plane_mm2 : (6,)
+        Variance of its position: what multiplies 1, y, z, y^2, y z, z^2.
     out : (at least the rows of left twice and of right once,) OPTICAL_POINT
         Filled.
     """
@@ -151,16 +164,17 @@ def run(
     )  # fmt: skip
     _write(out, 0, points, stereo, row, flags, _STEREO)
     joint, joint_covariance = np.empty((3, n)), np.empty((6, n))
-    covariance.constrain(points, stereo, terms.normal, distance_mm, terms.plane_mm**2, joint, joint_covariance)
+    variance = _plane_variance(points, plane_mm2)
+    covariance.constrain(points, stereo, terms.normal, distance_mm, variance, joint, joint_covariance)
     plane = closed_form.plane_from_pixel(right.centre_mm, right.ray_matrix, terms.normal, distance_mm)
     agreed = agreement.summary(active, seen[2:], plane, left.centre_mm, right.centre_mm, terms.normal)
 
     surface = np.zeros((3, 4))
     surface[0, :3] = terms.normal
     surface[2, 3] = 1.0
-    at_left = _active(first, verdicts[0], variances[0], left, terms, terms.left_px, surface, _LEFT, out, n)
+    at_left = _active(first, verdicts[0], variances[0], left, plane_mm2, terms.left_px, surface, _LEFT, out, n)
     at_right = _active(
-        second, verdicts[1], variances[1], right, terms, terms.right_px, surface, _RIGHT, out, n + at_left.shape[1]
+        second, verdicts[1], variances[1], right, plane_mm2, terms.right_px, surface, _RIGHT, out, n + at_left.shape[1]
     )  # fmt: skip
     m, last = n + at_left.shape[1], n + at_left.shape[1] + at_right.shape[1]
     every = np.empty((6, last))

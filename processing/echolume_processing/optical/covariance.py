@@ -90,14 +90,14 @@ def active_covariance(
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def constrain(
-    points: Values, cov: Values, normal: Values, distance: float, variance: float, moved: Values, out: Values
+    points: Values, cov: Values, normal: Values, distance: float, variance: Values, moved: Values, out: Values
 ) -> None:
     """See `joint`."""
     nx, ny, nz = normal[0], normal[1], normal[2]
     for i in range(points.shape[1]):
         xx, xy, xz, yy, yz, zz = cov[0, i], cov[1, i], cov[2, i], cov[3, i], cov[4, i], cov[5, i]
         kx, ky, kz = xx * nx + xy * ny + xz * nz, xy * nx + yy * ny + yz * nz, xz * nx + yz * ny + zz * nz
-        scale = 1.0 / (kx * nx + ky * ny + kz * nz + variance)
+        scale = 1.0 / (kx * nx + ky * ny + kz * nz + variance[i])
         off = (distance - nx * points[0, i] - ny * points[1, i] - nz * points[2, i]) * scale
         moved[0, i], moved[1, i], moved[2, i] = (
             points[0, i] + kx * off,
@@ -133,7 +133,8 @@ def joint(
     """
     require_shape("covariance", covariance, (6, points_mm.shape[1]))
     moved, out = np.empty_like(points_mm), np.empty_like(covariance)
-    constrain(points_mm, covariance, normal, distance_mm, plane_mm**2, moved, out)
+    variance = np.full(points_mm.shape[1], plane_mm**2)
+    constrain(points_mm, covariance, normal, distance_mm, variance, moved, out)
     return moved, out
 
 

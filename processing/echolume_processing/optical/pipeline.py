@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +21,8 @@ from echolume_processing.optical.select import Verdict
 Values = NDArray[np.float64]
 
 ALARM_SIGMAS = 2.0
+FIELD_MM = 100.0
+"""The guide's positions reach about this far from the middle."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +34,9 @@ class OpticalSettings:
     z_mm, y_mm : (float, float)
         Where a point may lie; beyond it is a reflection or clutter.
     plane_sigma_mm : float
-        How well the laser plane's position is known at each stripe (calibration and guide).
+        How well the laser plane's position is known where its calibration does not say so.
+    guide_sigma_mm : float
+        How well the guide's position is known where it does not say so.
     camera_sigma : float
         Error of the camera model over the RMS of its calibration: the root of parameters over observations.
     least_camera_px : float
@@ -43,6 +48,7 @@ class OpticalSettings:
     z_mm: tuple[float, float] = (-8.0, 80.0)
     y_mm: tuple[float, float] = (-130.0, 130.0)
     plane_sigma_mm: float = 0.02
+    guide_sigma_mm: float = 0.01
     camera_sigma: float = 0.25
     least_camera_px: float = 0.005
     run_rows: int = 12
@@ -87,6 +93,20 @@ class StripePoints:
         return {**labels, **reasons}
 
 
+def plane_covariance(laser: LaserCalibration, otherwise_mm: float) -> Values:
+    """Covariance (4, 4) of the laser plane's position over (1, s, y, z), in mm^2; see `LaserCalibration`."""
+    if isinstance(laser.plane_covariance, msgspec.UnsetType):
+        return np.diag([otherwise_mm**2, 0.0, 0.0, 0.0])
+    return np.array(laser.plane_covariance, dtype=np.float64)
+
+
+def plane_variance(plane: Values, x_mm: float) -> Values:
+    """What multiplies 1, y, z, y^2, y z, z^2 in the variance of the plane's position at a guide position, (6,)."""
+    at = np.array([[1.0, x_mm, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    c = at @ plane @ at.T
+    return np.array([c[0, 0], 2 * c[0, 1], 2 * c[0, 2], c[1, 1], 2 * c[1, 2], c[2, 2]])
+
+
 class OpticalPipeline:
     """Turns camera pairs into the paper's three point sets: ST, AT-left and AT-right.
 
@@ -128,9 +148,9 @@ class OpticalPipeline:
         self._normal = np.asarray(laser.normal, dtype=np.float64)
         left_px, right_px = (max(used.camera_sigma * c.rms_px, used.least_camera_px) for c in (left, right))
         self._terms = Terms(
-            np.array([*used.z_mm, *used.y_mm]), self._normal, used.plane_sigma_mm, left_px, right_px,
-            TOLERANCE_PX, used.run_rows,
-        )  # fmt: skip
+            np.array([*used.z_mm, *used.y_mm]), self._normal, left_px, right_px, TOLERANCE_PX, used.run_rows
+        )
+        self._plane_covariance = plane_covariance(laser, used.plane_sigma_mm)
         self._offset_mm = laser.offset_mm
         self._per_guide_mm = float(self._normal @ np.asarray(laser.guide_direction, dtype=np.float64))
         self._sizes = (left.height_px, left.width_px), (right.height_px, right.width_px)
@@ -163,10 +183,15 @@ class OpticalPipeline:
 
     @property
     def plane_limit_mm(self) -> float:
-        """A larger error of the laser plane is not explained by its stated sigma."""
-        return ALARM_SIGMAS * self._settings.plane_sigma_mm
+        """A larger error of the laser plane is not explained by its stated sigma.
 
-    def process(self, left: Frame, right: Frame, x_mm: float) -> Structured:
+        The cameras' errors look like the plane's, so that the limit does not fall below that of `plane_sigma_mm`.
+        """
+        used = self._settings
+        stated = [plane_variance(self._plane_covariance, x_mm)[0] for x_mm in (-FIELD_MM, 0.0, FIELD_MM)]
+        return ALARM_SIGMAS * max(used.plane_sigma_mm, float(np.sqrt(max(stated) + used.guide_sigma_mm**2)))
+
+    def process(self, left: Frame, right: Frame, x_mm: float, guide_sigma_mm: float | None = None) -> Structured:
         """Points of one stripe.
 
         Parameters
@@ -175,6 +200,8 @@ class OpticalPipeline:
             The frames of one trigger, not undistorted.
         x_mm : float
             The guide's position at the exposure.
+        guide_sigma_mm : float, optional
+            Its standard deviation, as the guide states it.
 
         Returns
         -------
@@ -190,9 +217,9 @@ class OpticalPipeline:
         ----------
         Llata et al., 2.2, eq. 1-4.
         """
-        return self.measure(left, right, x_mm).points
+        return self.measure(left, right, x_mm, guide_sigma_mm).points
 
-    def measure(self, left: Frame, right: Frame, x_mm: float) -> StripePoints:
+    def measure(self, left: Frame, right: Frame, x_mm: float, guide_sigma_mm: float | None = None) -> StripePoints:
         """Points of one stripe with their covariances, and what became of all candidates; see `process`.
 
         Notes
@@ -205,7 +232,11 @@ class OpticalPipeline:
                 raise ValueError(f"{name} frame: expected shape {size} of the calibration, got {frame.shape}")
         stripes = contiguous(stripe.extract(left)), contiguous(stripe.extract(right))
         out = np.empty(2 * len(left) + len(right), dtype=OPTICAL_POINT)
-        found = chain.run(*stripes, *self._views, self._terms, self._offset_mm + x_mm * self._per_guide_mm, out)
+        sigma_mm = self._settings.guide_sigma_mm if guide_sigma_mm is None else guide_sigma_mm
+        plane_mm2 = plane_variance(self._plane_covariance, x_mm)
+        plane_mm2[0] += (sigma_mm * self._per_guide_mm) ** 2
+        distance_mm = self._offset_mm + x_mm * self._per_guide_mm
+        found = chain.run(*stripes, *self._views, self._terms, distance_mm, plane_mm2, out)
         return StripePoints(
             out[: found.covariance.shape[1]],
             found.covariance,

@@ -93,7 +93,7 @@ class OpticalSubscriber:
         began_s = time.perf_counter()
         pixels = np.asarray(left.payload, dtype=np.uint8), np.asarray(right.payload, dtype=np.uint8)
         try:
-            found = setup.pipeline.measure(pixels[0], pixels[1], header.source.x_mm)
+            found = setup.pipeline.measure(pixels[0], pixels[1], header.source.x_mm, header.source.sigma_mm)
         except ValueError as error:
             log.error("trigger %d: the stripe is skipped: %s", header.trigger, error)
             self._counts["skipped"] += 1

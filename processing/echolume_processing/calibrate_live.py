@@ -120,6 +120,7 @@ def gather_optics(
     say: Say,
     stop: threading.Event,
     ended: Callable[[str], bool] = lambda _scan: False,
+    keep: Callable[[Message, Message], object] | None = None,
 ) -> OpticsCalibration:
     """Calibrate cameras and laser from the passes of a running calibration scan.
 
@@ -134,6 +135,8 @@ def gather_optics(
         Ends the session with what it has.
     ended : callable, optional
         Whether the scan of that name has ended, after which nothing more will come.
+    keep : callable, optional
+        Handed the left and right frame of each pair that is used.
 
     Raises
     ------
@@ -155,8 +158,9 @@ def gather_optics(
             if on_board:
                 say(f"{on_board}: {_lacks(shots, board)}")
             on_board = header.pass_name
-        for message in pair:
-            shots.take(message)
+        used = [shots.take(message) for message in pair]
+        if keep is not None and any(used):
+            keep(*pair)
     return calibrate_shots(shots, board)
 
 

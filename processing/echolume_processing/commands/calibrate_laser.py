@@ -1,12 +1,14 @@
-"""Calibrate cameras and laser from the passes board-NN and laser-NN of an archive, or while the scan runs.
+"""Calibrate cameras and laser from passes board-NN and laser-NN: of an archive, of a folder, or while the scan runs.
 
-Without an archive the passes are taken from the bus: start `echolume scan` with the plan calibrate.toml in another
-terminal. After each board the operator is told what is missing. The session ends with the scan, or by Ctrl-C with
-what there is. Folders of images hold no guide positions, so this command takes none.
+A folder holds pairs of images and a file frames.csv with the columns pass,x_mm,left,right: the pass (board-00,
+laser-00, ...), the guide's position in mm (empty for boards), and both images. Without archive or folder the passes
+are taken from the bus: start `echolume scan` with the plan calibrate.toml in another terminal. After each board the
+operator is told what is missing. The session ends with the scan, or by Ctrl-C with what there is.
 
 examples:
   echolume calibrate laser calibrate.mcap --into calibration.json
-  echolume calibrate laser --rig rig.toml --into calibration.json
+  echolume calibrate laser stripes/
+  echolume calibrate laser --rig rig.toml --into calibration.json --save stripes
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from typing import TYPE_CHECKING
 from echolume_messages.rig_option import add_rig, load_rig
 from echolume_processing.commands.board_option import add_board, chessboard
 from echolume_processing.commands.report_table import say_aside, write_table
+from echolume_processing.commands.stripe_folder import StripeFolder, read_shots
 
 if TYPE_CHECKING:
     from echolume_processing.optical.board import Pattern
@@ -29,10 +32,13 @@ if TYPE_CHECKING:
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     parser.description = __doc__
-    parser.add_argument("archive", type=Path, nargs="?", help="archive (.mcap) of a calibration scan")
+    parser.add_argument(
+        "archive", type=Path, nargs="?", help="archive (.mcap) of a calibration scan, or a folder with frames.csv"
+    )
     add_board(parser, charuco=False)
     add_rig(parser)
     parser.add_argument("--into", type=Path, metavar="FILE", help="calibration file whose optical parts to replace")
+    parser.add_argument("--save", type=Path, metavar="FOLDER", help="live: keep the images taken as such a folder")
     parser.add_argument("--json", action="store_true", help="print the figures as JSON")
 
 
@@ -41,11 +47,16 @@ def run(args: argparse.Namespace) -> int:
     import msgspec
 
     from echolume_messages import calibration as calibration_file
-    from echolume_processing.optical.calibrate_rig import calibrate_optics
+    from echolume_processing.optical.calibrate_rig import calibrate_optics, calibrate_shots
 
     board = chessboard(args)
     before = calibration_file.load(args.into) if args.into else None
-    found = _live(args, board) if args.archive is None else calibrate_optics(args.archive, board)
+    if args.archive is None:
+        found = _live(args, board)
+    elif args.archive.is_dir():
+        found = calibrate_shots(read_shots(args.archive), board)
+    else:
+        found = calibrate_optics(args.archive, board)
     if before is not None:
         updated = msgspec.structs.replace(
             before, left=found.left, right=found.right, stereo_rms_px=found.stereo_rms_px, laser=found.laser
@@ -67,16 +78,18 @@ def _live(args: argparse.Namespace, board: Pattern) -> OpticsCalibration:
 
     from echolume_messages.bus import connect
     from echolume_messages.bus.lifetime import stopped_by_signals
+    from echolume_messages.files import make_folder
     from echolume_processing.calibrate_live import LedgerEnd, camera_pairs, gather_optics
 
     rig = load_rig(args.rig)
+    keep = StripeFolder(make_folder(args.save, "--save")).keep if args.save is not None else None
     stop = threading.Event()
     with stopped_by_signals(stop), connect(rig.bus.endpoint, rig.name) as bus:
         ended = LedgerEnd(bus)
         say_aside(
             "waiting for passes board-NN and laser-NN; start the scan calibrate.toml; Ctrl-C ends with what there is"
         )
-        return gather_optics(camera_pairs(bus), board, say_aside, stop, ended)
+        return gather_optics(camera_pairs(bus), board, say_aside, stop, ended, keep)
 
 
 def rows(found: OpticsCalibration) -> list[tuple[str, str]]:

@@ -17,9 +17,6 @@ PUBLISHED = re.compile(r"^avg_reprojection_error:\s*(?P<value>[-+.0-9eE]+)\s*$",
 
 def read_pairs(folder: Path) -> tuple[list[str], list[Frame], list[Frame]]:
     """Names and images of the pairs ``leftNN``/``rightNN`` in a folder, in the order of their names."""
-    import cv2
-    import numpy as np
-
     if not folder.is_dir():
         raise ConfigError(f"{folder}: no such folder; give the one with leftNN and rightNN images")
     names: list[str] = []
@@ -32,14 +29,22 @@ def read_pairs(folder: Path) -> tuple[list[str], list[Frame], list[Frame]]:
         if not right.is_file():
             raise ConfigError(f"{right}: missing; {left.name} has no partner")
         for path, side in ((left, images[0]), (right, images[1])):
-            image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-            if image is None:
-                raise ConfigError(f"{path}: not an image that can be read")
-            side.append(np.asarray(image, dtype=np.uint8))
+            side.append(read_image(path))
         names.append(found["number"])
     if not names:
         raise ConfigError(f"{folder}: no images named leftNN.jpg (png, bmp, tif) with their rightNN")
     return names, *images
+
+
+def read_image(path: Path) -> Frame:
+    """One image in gray."""
+    import cv2
+    import numpy as np
+
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise ConfigError(f"{path}: not an image that can be read")
+    return np.asarray(image, dtype=np.uint8)
 
 
 def published_rms_px(folder: Path) -> float | None:
@@ -51,11 +56,15 @@ def published_rms_px(folder: Path) -> float | None:
 
 def write_pair(folder: Path, number: int, left: Frame, right: Frame) -> None:
     """Write one pair as ``leftNN.png`` and ``rightNN.png``."""
+    for side, image in (("left", left), ("right", right)):
+        write_image(folder / f"{side}{number:02d}.png", image)
+
+
+def write_image(path: Path, image: Frame) -> None:
+    """Write one image as PNG."""
     import cv2
 
-    for side, image in (("left", left), ("right", right)):
-        path = folder / f"{side}{number:02d}.png"
-        try:
-            path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
-        except OSError as error:
-            raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
+    try:
+        path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error

@@ -51,12 +51,14 @@ class CalibrationShots:
             return False
         left, right = pair[topics.CAMERA_LEFT.name], pair[topics.CAMERA_RIGHT.name]
         frames = left.payload.astype(np.uint8, copy=False), right.payload.astype(np.uint8, copy=False)
-        if header.pass_name.startswith(BOARD):
-            self._best[key] = header.attempt, frames
-        else:
-            shot = LitShot(_guide_mm(left), stripe.extract(frames[0]), stripe.extract(frames[1]))
-            self._best[key] = header.attempt, shot
+        x_mm = None if header.pass_name.startswith(BOARD) else _guide_mm(left)
+        self.add(header.pass_name, header.trigger, x_mm, frames, header.attempt)
         return True
+
+    def add(self, pass_name: str, trigger: int, x_mm: float | None, frames: FramePair, attempt: int = 0) -> None:
+        """Take a pair of images: of a board, or where the guide's position is given of the stripe on it."""
+        shot = frames if x_mm is None else LitShot(x_mm, stripe.extract(frames[0]), stripe.extract(frames[1]))
+        self._best[pass_name, trigger] = attempt, shot
 
     def by_pose(self) -> tuple[dict[str, list[FramePair]], dict[str, list[LitShot]]]:
         """Frame pairs by the name of their board pass, and stripes by the number of their laser pass."""

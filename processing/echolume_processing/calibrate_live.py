@@ -25,7 +25,10 @@ from echolume_processing.subscribers.pairing import Pairs
 Say = Callable[[str], object]
 
 STEP_S = 0.2
-DEPTH = 24
+DEPTH = 64
+IDLE_TURNS = 10
+"""Turns without a pair after which the operator is taken to be moving the board. Only then is a calibration tried: it
+takes seconds, and frames would have to wait."""
 MIN_BOARDS = 4
 """Boards before a first trial of the laser's calibration."""
 
@@ -130,7 +133,7 @@ def gather_optics(
         Passes as `calibrate_optics` takes them. When another scan begins, what there was is forgotten.
     board : Pattern
     say : callable
-        Told after each board what a calibration from the boards so far lacks.
+        Told of each board, and in the pauses what a calibration from the boards so far lacks.
     stop : Event
         Ends the session with what it has.
     ended : callable, optional
@@ -143,24 +146,30 @@ def gather_optics(
     CalibrationRejectedError
         If what there is at the end does not make a calibration.
     """
-    shots, scan, on_board = CalibrationShots(), "", ""
+    shots, scan, on_board, idle, fresh = CalibrationShots(), "", "", 0, False
     while not stop.is_set():
         pair = pairs.get(STEP_S)
         if pair is None:
+            idle += 1
             if scan and ended(scan):
                 break
+            if fresh and idle >= IDLE_TURNS:
+                say(f"{on_board}: {_lacks(shots, board)}")
+                fresh = False
             continue
+        idle = 0
         header = pair[0].header
         if header.scan != scan:
             shots, scan, on_board = CalibrationShots(), header.scan, ""
             say(f"scan {scan}")
         if header.pass_name.startswith(BOARD) and header.pass_name != on_board:
-            if on_board:
-                say(f"{on_board}: {_lacks(shots, board)}")
             on_board = header.pass_name
-        used = [shots.take(message) for message in pair]
-        if keep is not None and any(used):
-            keep(*pair)
+            say(f"{on_board}: taken")
+        taken = [shots.take(message) for message in pair]
+        if any(taken):
+            fresh = True
+            if keep is not None:
+                keep(*pair)
     return calibrate_shots(shots, board)
 
 

@@ -117,6 +117,15 @@ def test_points_that_are_not_of_the_line_do_not_turn_it() -> None:
     assert stripe_alignment(points).about_z_deg == pytest.approx(0.344, abs=0.01)
 
 
+def test_a_few_false_points_do_not_invent_a_turn_about_y() -> None:
+    points = line_points(height=np.zeros_like)
+    points[[100, 300], 2] += 150.0
+    points[500] += [-30.0, 0.0, -120.0]
+    found = stripe_alignment(points)
+    assert found.about_y_deg is None
+    assert found.about_z_deg == pytest.approx(0.344, abs=0.01)
+
+
 def test_a_parallel_plane_has_no_angle() -> None:
     assert plane_alignment(np.array([1.0, 0.0, 0.0])).over_field_mm == 0
     tilted = plane_alignment(np.array([1.0, -SLOPES[0], -SLOPES[1]]))

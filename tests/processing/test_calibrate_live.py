@@ -22,7 +22,7 @@ from echolume_messages.calibration import ArrayCalibration, Calibration, CameraC
 from echolume_messages.errors import CalibrationMissingError, CalibrationRejectedError
 from echolume_messages.header import Header, Source
 from echolume_messages.rig_option import load_rig
-from echolume_processing.calibrate_live import LedgerEnd, gather_optics, gather_views, watch_alignment
+from echolume_processing.calibrate_live import IDLE_TURNS, LedgerEnd, gather_optics, gather_views, watch_alignment
 from echolume_processing.commands import calibrate
 from echolume_processing.commands.image_pairs import read_pairs, write_pair
 from echolume_processing.optical.board import Pattern
@@ -41,15 +41,17 @@ MIDDLE = np.array([80.0, 50.0, 0.0])
 class Given:
     """Pairs that are there already; then the session is stopped."""
 
-    def __init__(self, pairs: Iterable[tuple[Message, Message]], stop: threading.Event | None = None) -> None:
+    def __init__(self, pairs: Iterable[tuple[Message, Message] | None], stop: threading.Event | None = None) -> None:
         self._pairs = iter(pairs)
         self._stop = stop
 
     def get(self, timeout_s: float) -> tuple[Message, Message] | None:
-        pair = next(self._pairs, None)
-        if pair is None and self._stop is not None:
-            self._stop.set()
-        return pair
+        try:
+            return next(self._pairs)
+        except StopIteration:
+            if self._stop is not None:
+                self._stop.set()
+            return None
 
 
 def message(topic: topics.Topic, frame: np.ndarray, trigger: int, pass_name: str = "board-00", **source) -> Message:
@@ -142,9 +144,19 @@ def test_the_laser_is_calibrated_while_the_scan_runs() -> None:
         Given(scan_pairs()[:15]), BOARD, said.append, threading.Event(), ended=lambda scan: scan == "calibration"
     )
     assert len(found.report.views) == 5
-    assert said[:2] == ["scan calibration", "board-00: taken; 3 more boards for a first trial"]
-    assert said[-1].startswith("board-03: would do: stereo 0.0")
+    assert said == ["scan calibration", *(f"board-0{k}: taken" for k in range(5))]
     assert found.report.parallel_deg < 1.0
+
+
+def test_in_a_pause_the_operator_is_told_what_a_calibration_would_lack() -> None:
+    pause = [None] * IDLE_TURNS
+    given = Given([*scan_pairs()[:3], *pause, *pause, *scan_pairs()[3:12], *pause])
+    said: list[str] = []
+    stop = threading.Event()
+    gather_optics(given, BOARD, said.append, stop, ended=lambda _: said[-1].startswith("board-03: would do"))
+    assert said[:3] == ["scan calibration", "board-00: taken", "board-00: taken; 3 more boards for a first trial"]
+    assert said[3:6] == [f"board-0{k}: taken" for k in (1, 2, 3)]
+    assert said[6].startswith("board-03: would do: stereo 0.0")
 
 
 def test_a_session_stopped_too_early_says_what_it_lacks() -> None:

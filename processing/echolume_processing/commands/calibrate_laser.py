@@ -89,7 +89,11 @@ def _live(args: argparse.Namespace, board: Pattern) -> OpticsCalibration:
         say_aside(
             "waiting for passes board-NN and laser-NN; start the scan calibrate.toml; Ctrl-C ends with what there is"
         )
-        return gather_optics(camera_pairs(bus), board, say_aside, stop, ended, keep)
+        pairs = camera_pairs(bus)
+        found = gather_optics(pairs, board, say_aside, stop, ended, keep)
+        if pairs.lost:
+            say_aside(f"{pairs.lost} frames did not arrive; boards or stripes may be missing from this calibration")
+        return found
 
 
 def rows(found: OpticsCalibration) -> list[tuple[str, str]]:

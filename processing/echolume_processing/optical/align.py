@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from echolume_messages.errors import CalibrationRejectedError
@@ -23,6 +24,9 @@ MAX_STEP_PX = 4.0
 """Neighbouring rows of one stripe differ by less."""
 MIN_POINTS = 50
 MIN_LENGTH_MM = 20.0
+NEIGHBOURS = 9
+ALONE_MM = 2.0
+"""A point this far from the median of its neighbours along the line is another light."""
 MIN_HEIGHT_MM = 3.0
 """The tilt about y is known only if heights vary by this (RMS, apart from a slope along y)."""
 
@@ -84,7 +88,7 @@ def stripe_alignment(points_mm: Points3) -> Alignment:
     Parameters
     ----------
     points_mm : (n, 3) float64
-        Points of one stripe, rig frame; they need not lie on one surface.
+        Points of one stripe in their order along it, rig frame; they need not lie on one surface.
 
     Returns
     -------
@@ -101,7 +105,7 @@ def stripe_alignment(points_mm: Points3) -> Alignment:
     the stripe is a line and tells only the turn about z.
     """
     require_shape("points_mm", points_mm, (None, 3))
-    points = points_mm[np.isfinite(points_mm).all(axis=1)]
+    points = _in_company(points_mm[np.isfinite(points_mm).all(axis=1)])
     spread_mm = float(points[:, 1].std()) if len(points) else 0.0
     if len(points) < MIN_POINTS or spread_mm < MIN_LENGTH_MM:
         raise CalibrationRejectedError(
@@ -123,6 +127,17 @@ def stripe_alignment(points_mm: Points3) -> Alignment:
         _degrees(sigma[2]) if known else float("nan"),
         int(fit.weights.sum()),
     )
+
+
+def _in_company(points: Points3) -> Points3:
+    """Points whose height or x their neighbours share: a few false ones far off the line would turn the plane."""
+    if len(points) < NEIGHBOURS:
+        return points
+    near = np.ones(len(points), dtype=np.bool_)
+    for axis in (0, 2):
+        middle = np.median(sliding_window_view(np.pad(points[:, axis], NEIGHBOURS // 2, "edge"), NEIGHBOURS), axis=1)
+        near &= np.abs(points[:, axis] - middle) < ALONE_MM
+    return points[near]
 
 
 def stripe_points(cameras: tuple[Camera, Camera], left: Stripe, right: Stripe) -> Points3:

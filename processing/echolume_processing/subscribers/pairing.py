@@ -22,6 +22,11 @@ class Frames(Protocol):
         """The next frame."""
         ...
 
+    @property
+    def stats(self) -> dict[str, int]:
+        """Counts, `lost` among them."""
+        ...
+
 
 class Pairs:
     """Left and right frames of the same scan, trigger and attempt.
@@ -36,6 +41,11 @@ class Pairs:
         self._now_s = now_s
         self._moved_s = now_s()
         self.unpaired = 0
+
+    @property
+    def lost(self) -> int:
+        """Frames of both cameras that did not come and could not be had again."""
+        return sum(stream.stats["lost"] for stream in self._streams)
 
     def get(self, timeout_s: float) -> tuple[Message, Message] | None:
         """The next (left, right) pair, or None if one more frame did not complete any."""

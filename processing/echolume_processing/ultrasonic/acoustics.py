@@ -1,18 +1,23 @@
-"""The disk-shaped transducer: Rayleigh integral, pressure on its axis, directivity, and energy over a turned plate.
+"""The disk-shaped transducer: Rayleigh integral, pressure on its axis, near and far field, directivity, beam angles.
 
-Wavenumbers are in rad/mm, lengths in mm, angles in rad.
+Wavenumbers are in rad/mm, lengths in mm, angles in rad. Pressures are in units of rho c U0.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
-from scipy.special import j1
+from scipy.optimize import root_scalar
+from scipy.special import j1, jn_zeros
 
 from echolume_messages.geometry import Points3, require_shape
+
+FAR_WITHIN = 0.01
+"""The far field begins where the pressure on the axis has come this close to its far law k R^2 / (2 r)."""
+FIRST_NODES, MOST_NODES = 32, 65_536
+AGREED = 1e-12
+"""Twice as many nodes change a pressure by less than this share of the largest it can have at its distance."""
+CHUNK = 1 << 20
 
 
 def directivity(x: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -26,175 +31,132 @@ def directivity(x: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(np.abs(x) < 1e-9, 1.0, 2 * j1(safe) / safe)
 
 
-def rayleigh_pressure(
-    points_mm: Points3, wavenumber: float, radius_mm: float, rings: int = 96, spokes: int = 192
-) -> NDArray[np.complex128]:
-    """Complex pressure of a disk in a baffle, in units of rho c U0, by the Rayleigh integral.
+def rayleigh_pressure(points_mm: Points3, wavenumber: float, radius_mm: float) -> NDArray[np.complex128]:
+    """Complex pressure of a disk in a baffle by the Rayleigh integral: j k / (2 pi) times that of exp(-j k r') / r'.
 
     Parameters
     ----------
     points_mm : (n, 3) float64
-        The disk lies in the plane z = 0, its centre at the origin.
+        The disk lies in the plane z = 0, its centre at the origin; z >= 0.
     wavenumber : float
         rad/mm.
     radius_mm : float
-    rings, spokes : int
-        Gauss-Legendre nodes along the radius (in its square) and evenly spaced ones around.
 
     Returns
     -------
     (n,) complex128
-        j k / (2 pi) times the integral of exp(-j k r') / r' over the disk, time factor left out.
+        Time factor left out.
+
+    Raises
+    ------
+    ValueError
+        If a point lies behind the baffle, or so close to the disk's edge that 65536 nodes do not settle its pressure.
+
+    Notes
+    -----
+    The integral over the disk is done by hand along the lines from the point's foot to the edge (Schoch's way). What
+    is left runs around the edge; with D the squared distance from the foot to the edge and z + d = sqrt(z^2 + D),
+
+        p = exp(-j k z) * mean over phi of (1 - exp(-j k d)) R (R - r cos phi) / D,
+
+    which has no pole, as d vanishes with D. The integrand is periodic and analytic, so evenly spaced nodes converge
+    geometrically; their number is doubled until nothing changes by more than 1e-12. 32 do from a radius away on.
 
     References
     ----------
-    The paper, equation 5; Rayleigh, The Theory of Sound, section 278.
+    The paper, equation 5; Rayleigh, The Theory of Sound, section 278; A. Schoch, Akustische Zeitschrift 6 (1941), 318.
     """
     require_shape("points_mm", points_mm, (None, 3))
-    nodes, weights = np.polynomial.legendre.leggauss(rings)
-    radii = radius_mm * np.sqrt(0.5 * (nodes + 1))
-    angles = 2 * np.pi * (np.arange(spokes) + 0.5) / spokes
-    x = (radii[:, None] * np.cos(angles)).ravel()
-    y = (radii[:, None] * np.sin(angles)).ravel()
-    area = np.repeat(0.25 * radius_mm**2 * weights, spokes) * (2 * np.pi / spokes)
+    if np.any(points_mm[:, 2] < 0):
+        raise ValueError(f"points_mm: expected z >= 0, got {points_mm[:, 2].min()} mm: that is behind the baffle")
     out = np.empty(len(points_mm), dtype=np.complex128)
-    for k, (px, py, pz) in enumerate(points_mm):
-        distance = np.sqrt((px - x) ** 2 + (py - y) ** 2 + pz**2)
-        out[k] = np.sum(np.exp(-1j * wavenumber * distance) / distance * area)
-    return 1j * wavenumber / (2 * np.pi) * out
+    open_ = np.arange(len(points_mm))
+    nodes = FIRST_NODES
+    coarse = _edge_mean(points_mm, wavenumber, radius_mm, nodes)
+    away_mm = np.linalg.norm(points_mm, axis=1)
+    largest = np.minimum(2.0, wavenumber * radius_mm**2 / np.maximum(away_mm, 1e-9))
+    while open_.size:
+        if nodes >= MOST_NODES:
+            raise ValueError(
+                f"points_mm: {open_.size} points, the first at {points_mm[open_[0]]} mm, lie too close to the edge of "
+                f"the disk of {radius_mm} mm; move them 0.01 mm away"
+            )
+        nodes *= 2
+        fine = _edge_mean(points_mm[open_], wavenumber, radius_mm, nodes)
+        settled = np.abs(fine - coarse) <= AGREED * largest[open_]
+        out[open_[settled]] = fine[settled]
+        open_, coarse = open_[~settled], fine[~settled]
+    return out
+
+
+def _edge_mean(points_mm: Points3, wavenumber: float, radius_mm: float, nodes: int) -> NDArray[np.complex128]:
+    """The mean around the edge by evenly spaced nodes; symmetric, so half the edge is enough."""
+    cosine = np.cos(np.pi * (np.arange(nodes) + 0.5) / nodes)
+    out = np.empty(len(points_mm), dtype=np.complex128)
+    rows = max(1, CHUNK // nodes)
+    for first in range(0, len(points_mm), rows):
+        part = slice(first, first + rows)
+        z = points_mm[part, 2:]  # (rows, 1)
+        r = np.hypot(points_mm[part, :1], points_mm[part, 1:2])
+        square = (r - radius_mm) ** 2 + 2 * r * radius_mm * (1 - cosine)
+        detour = square / (np.sqrt(z * z + square) + z)
+        wave = -np.expm1(-1j * wavenumber * detour) * (radius_mm * (radius_mm - r * cosine) / square)
+        out[part] = np.exp(-1j * wavenumber * z[:, 0]) * wave.mean(axis=1)
+    return out
 
 
 def axial_pressure(distance_mm: NDArray[np.float64], wavenumber: float, radius_mm: float) -> NDArray[np.float64]:
-    """Magnitude of the pressure on the disk's axis, in units of rho c U0, any shape.
+    """Magnitude of the pressure on the disk's axis, any shape.
 
     References
     ----------
     The paper, equation 6.
     """
-    root = np.sqrt(1 + (radius_mm / distance_mm) ** 2) - 1
+    square = (radius_mm / distance_mm) ** 2
+    root = square / (np.sqrt(1 + square) + 1)  # sqrt(1 + square) - 1 without cancellation far away
     return 2 * np.abs(np.sin(0.5 * wavenumber * distance_mm * root))
 
 
 def near_field_mm(wavenumber: float, radius_mm: float) -> float:
-    """Distance of the last maximum on the axis, where the far field begins: R^2 / wavelength - wavelength / 4."""
-    wavelength_mm = 2 * np.pi / wavenumber
-    return radius_mm**2 / wavelength_mm - 0.25 * wavelength_mm
+    """Distance of the last maximum on the axis, where the near field ends: R^2 / wavelength - wavelength / 4.
 
+    0 for a disk of less than half a wavelength: its pressure falls from its face on.
 
-def plate_energy(
-    angle_rad: NDArray[np.float64], distance_mm: float, separation_mm: float, wavenumber_radius: float
-) -> NDArray[np.float64]:
-    """Energy that two receivers beside an emitter (R-E-R) get back from a wide plate turned about the emitter's foot.
-
-    Parameters
+    References
     ----------
-    angle_rad : (n,) float64
-        Of the plate, 0: perpendicular to the emitter's axis.
-    distance_mm : float
-        Emitter to plate along the axis.
-    separation_mm : float
-        Between the two receivers.
-    wavenumber_radius : float
-        k R of all transducers.
+    The paper, equation 6 and what follows it.
+    """
+    wavelength_mm = 2 * np.pi / wavenumber
+    return max(0.0, radius_mm**2 / wavelength_mm - 0.25 * wavelength_mm)
 
-    Returns
-    -------
-    (n,) float64
-        Normalised to 1 at its largest.
+
+def far_field_mm(wavenumber: float, radius_mm: float) -> float:
+    """Distance from which on the pressure on the axis is within 1 % of its far law k R^2 / (2 r).
 
     Notes
     -----
-    Image source, directivity both ways, spherical spreading, squared.
-
-    References
-    ----------
-    The paper, section 3.2 and figure 6.
+    About k R^2 for wide disks, or six near fields; there is no sharp border, hence a tolerance.
     """
-    require_shape("angle_rad", angle_rad, (None,))
-    normal = np.column_stack([-np.sin(angle_rad), np.cos(angle_rad)])  # (n, 2): along the array, along its axis
-    # Plate through (0, distance): the emitter's image is 2 (n . p) n.
-    image = 2 * (distance_mm * normal[:, 1])[:, None] * normal
-    total = np.zeros(len(angle_rad))
-    for side in (-0.5, 0.5):
-        way = np.array([side * separation_mm, 0.0]) - image
-        path = np.linalg.norm(way, axis=1)
-        unit = way / path[:, None]
-        leaving = unit - 2 * np.sum(unit * normal, axis=1)[:, None] * normal
-        arrive = directivity(wavenumber_radius * unit[:, 0])
-        leave = directivity(wavenumber_radius * leaving[:, 0])
-        forward = (leaving[:, 1] > 0) & (unit[:, 1] < 0)
-        total += np.where(forward, (arrive * leave / path) ** 2, 0.0)
-    return total / total.max()
+    law = 0.5 * wavenumber * radius_mm**2
+
+    def lack(distance_mm: float) -> float:
+        pressure = axial_pressure(np.array([distance_mm]), wavenumber, radius_mm)
+        return float(pressure[0]) * distance_mm / law - 1 + FAR_WITHIN
+
+    low = max(near_field_mm(wavenumber, radius_mm), 1e-3 * radius_mm)
+    return float(root_scalar(lack, bracket=(low, 1e3 * (radius_mm + law))).root)
 
 
-@dataclass(frozen=True)
-class GaussianFit:
-    """a exp(-(angle - b)^2 / c^2); b and c in rad."""
-
-    a: float
-    b_rad: float
-    c_rad: float
+def first_zero_rad(wavenumber_radius: float) -> float:
+    """Angle of the directivity's first zero, where the main lobe ends; pi/2 if the lobe fills the half space."""
+    return float(np.arcsin(min(1.0, float(jn_zeros(1, 1)[0]) / wavenumber_radius)))
 
 
-def fit_gaussian(angle_rad: NDArray[np.float64], energy: NDArray[np.float64]) -> GaussianFit:
-    """Fit the paper's Gaussian to energy over the plate's angle, both (n,).
+def half_angle_rad(wavenumber_radius: float) -> float:
+    """Angle off the axis at which the pressure has fallen to a half (-6 dB, one way); pi/2 if it never does."""
 
-    References
-    ----------
-    The paper, equation 9.
-    """
-    require_shape("energy", energy, angle_rad.shape)
+    def above_half(x: float) -> float:
+        return float(directivity(np.array([x]))[0]) - 0.5
 
-    def residuals(p: NDArray[np.float64]) -> NDArray[np.float64]:
-        return p[0] * np.exp(-((angle_rad - p[1]) ** 2) / p[2] ** 2) - energy
-
-    start = np.array([float(energy.max()), float(angle_rad[np.argmax(energy)]), 0.3])
-    a, b, c = (float(v) for v in least_squares(residuals, start).x)
-    return GaussianFit(a, b, abs(c))
-
-
-def angle_from_energy(energy: float, fit: GaussianFit) -> float:
-    """Magnitude of the plate's angle off its best one (rad) from its normalised energy: equation 9 turned round."""
-    return fit.c_rad * float(np.sqrt(np.log(fit.a / min(energy, fit.a))))
-
-
-TABLE_I: tuple[tuple[float, float, float, float, float], ...] = (
-    (200.0, 30.0, 1.00, 0.56, 21.2),
-    (200.0, 100.0, 1.02, 2.18, 18.7),
-    (200.0, 150.0, 0.95, 0.39, 18.27),
-    (400.0, 30.0, 0.99, -2.11, 17.81),
-    (400.0, 100.0, 0.97, -1.86, 18.02),
-    (400.0, 150.0, 0.99, -2.13, 18.03),
-    (600.0, 30.0, 0.97, 3.74, 17.84),
-    (600.0, 100.0, 0.98, 2.54, 18.15),
-    (600.0, 150.0, 0.96, 3.22, 17.61),
-    (800.0, 30.0, 0.98, 5.05, 17.96),
-    (800.0, 100.0, 0.97, 3.61, 19.5),
-    (800.0, 150.0, 0.95, 2.28, 18.6),
-)
-"""The paper's Table I: distance_mm, separation_mm, a, b in deg, c in deg."""
-
-
-def table_widths_deg(wavenumber_radius: float) -> NDArray[np.float64]:
-    """Widths c (deg) of Table I's twelve rows as one physical k R predicts them, (12,)."""
-    angle_rad = np.radians(np.linspace(-45, 45, 91))
-    fits = [fit_gaussian(angle_rad, plate_energy(angle_rad, row[0], row[1], wavenumber_radius)) for row in TABLE_I]
-    return np.degrees(np.array([fit.c_rad for fit in fits]))
-
-
-def fit_table() -> tuple[float, float]:
-    """The k R that reproduces Table I best, and the RMS (deg) of its c over the twelve rows."""
-    measured = np.array([row[4] for row in TABLE_I])
-
-    def rms(wavenumber_radius: float) -> float:
-        return float(np.sqrt(np.mean((table_widths_deg(wavenumber_radius) - measured) ** 2)))
-
-    low, high = 3.0, 7.0
-    for _ in range(24):
-        third = (high - low) / 3
-        if rms(low + third) < rms(high - third):
-            high -= third
-        else:
-            low += third
-    middle = 0.5 * (low + high)
-    return middle, rms(middle)
+    x = float(root_scalar(above_half, bracket=(0.0, float(jn_zeros(1, 1)[0]))).root)
+    return float(np.arcsin(min(1.0, x / wavenumber_radius)))

@@ -64,6 +64,11 @@ class TableFit:
         return np.degrees([g.c_rad for g in self.gaussians]) - _C_DEG
 
     @property
+    def level(self) -> float:
+        """Of cross-talk, 0 without."""
+        return 0.0 if self.cross_talk is None else self.cross_talk.level
+
+    @property
     def rms_c_deg(self) -> float:
         """Over all twelve rows."""
         return float(np.sqrt(np.mean(self.residuals_c_deg**2)))

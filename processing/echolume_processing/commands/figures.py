@@ -36,10 +36,9 @@ def run(args: argparse.Namespace) -> int:
     from echolume_processing.ultrasonic.table_one import fit_table, fit_table_with_cross_talk, table_lines
 
     out = make_folder(args.out)
+    of_scan = [] if args.archive is None else _of_scan(args.archive, out)
     plain, lifted = fit_table(), fit_table_with_cross_talk()
-    drawn = figures_physics.draw(plain, lifted, out)
-    if args.archive is not None:
-        drawn += _of_scan(args.archive, out)
+    drawn = figures_physics.draw(plain, lifted, out) + of_scan
     if args.json:
         sys.stdout.write(json.dumps(_report(plain, lifted, drawn), indent=1) + "\n")
         return 0

@@ -40,6 +40,7 @@ def test_the_papers_pictures_of_sound_are_drawn_and_table_1_is_printed(
     assert text.count("(+") + text.count("(-") == 2 * len(TABLE_I)
 
 
+@pytest.mark.timeout(300)  # where kernels were never compiled, this is the first to need the fusion's
 def test_json_holds_the_table_and_an_archive_adds_its_scans_pictures(
     recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

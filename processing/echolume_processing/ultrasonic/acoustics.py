@@ -79,7 +79,7 @@ def rayleigh_pressure(points_mm: Points3, wavenumber: float, radius_mm: float) -
         if nodes >= MOST_NODES:
             raise ValueError(
                 f"points_mm: {open_.size} points, the first at {points_mm[open_[0]]} mm, lie too close to the edge of "
-                f"the disk of {radius_mm} mm; move them 0.01 mm away"
+                f"the disk of {radius_mm} mm; move them {radius_mm / 500:.2g} mm away"
             )
         nodes *= 2
         fine = _edge_mean(points_mm[open_], wavenumber, radius_mm, nodes)

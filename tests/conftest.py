@@ -18,11 +18,14 @@ CHECKED = (
     "echolume_processing.optical.triangulate",
     "echolume_processing.ultrasonic.acoustics",
     "echolume_processing.ultrasonic.contact",
+    "echolume_processing.ultrasonic.cross_talk",
     "echolume_processing.ultrasonic.envelope",
     "echolume_processing.ultrasonic.flight",
     "echolume_processing.ultrasonic.image",
     "echolume_processing.ultrasonic.lobes",
     "echolume_processing.ultrasonic.plate",
+    "echolume_processing.ultrasonic.plate_energy",
+    "echolume_processing.ultrasonic.table_one",
 )
 
 beartype_packages(CHECKED, conf=BeartypeConf(is_pep484_tower=True))

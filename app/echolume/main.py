@@ -27,6 +27,8 @@ SUMMARIES = {
     "calibrate": "calibrate cameras, laser or array",
     "process": "run one of the lab's subscribers",
     "reprocess": "rebuild the hybrid map from a raw archive",
+    "figures": "draw the paper's figures, and those of a scan",
+    "image": "acoustic images of a scan, and the volume by delay-and-sum",
     "localise": "locate a target in recorded echoes of a 1+N array",
 }
 

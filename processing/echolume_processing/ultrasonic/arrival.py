@@ -25,8 +25,8 @@ LEVELS = np.arange(np.log(40.0), np.log(4000.0), LEVEL_STEP)
 class EchoModel:
     """How envelopes scatter around |background + echo|; in samples and the envelope's unit."""
 
-    noise: float = 24.0
-    share: float = 0.03
+    noise: float = 20.0
+    share: float = 0.02
     """Part of an echo's height by which its shape may differ from the pulse."""
     phase_walk_rad: float = 0.3
     """Standard deviation of the change of the phase between echo and background, from one sample to the next."""
@@ -37,7 +37,7 @@ class EchoModel:
     tempering: float = 0.6
     """Power of a channel's likelihood: its samples are not independent."""
     arrival_spread: float = 0.25
-    level_spread: float = 0.25
+    level_spread: float = 0.2
     """Standard deviations, in samples and as a logarithm, that the geometry leaves unexplained."""
     lost: float = 0.05
     """Probability that a channel does not hear the target."""

@@ -84,11 +84,24 @@ def expected(
     return arrival, np.einsum("pct,ct->pc", level_terms(answer, localiser.elements_mm), localiser.spreading)
 
 
-def search_grid(half_mm: float = 110.0, depth_mm: tuple[float, float] = (60.0, 260.0), step_mm: float = 6.0) -> Points3:
-    """Places in front of the emitter, (places, 3)."""
-    side = np.arange(-half_mm, half_mm + 0.5 * step_mm, step_mm)
-    depth = np.arange(depth_mm[0], depth_mm[1] + 0.5 * step_mm, step_mm)
-    return np.stack(np.meshgrid(side, side, depth, indexing="ij"), axis=-1).reshape(-1, 3)
+def search_grid(
+    low_mm: tuple[float, float, float] = (-110.0, -110.0, 60.0),
+    high_mm: tuple[float, float, float] = (110.0, 110.0, 260.0),
+    side_step_mm: float = 6.0,
+    depth_step_mm: float = 2.5,
+) -> Points3:
+    """Places in a box in front of the emitter, (places, 3); finer in depth, which changes a path most."""
+    steps_mm = (side_step_mm, side_step_mm, depth_step_mm)
+    sides = [np.arange(lo, hi + 0.5 * step, step) for lo, hi, step in zip(low_mm, high_mm, steps_mm, strict=True)]
+    return np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def grid_around(known_mm: Points3, margin_mm: float = 20.0) -> Points3:
+    """Places in the box that holds the known ones, and this much around it, (places, 3)."""
+    require_shape("known_mm", known_mm, (None, 3))
+    x, y, z = (float(v) for v in known_mm.min(axis=0) - margin_mm)
+    far_x, far_y, far_z = (float(v) for v in known_mm.max(axis=0) + margin_mm)
+    return search_grid((x, y, z), (far_x, far_y, far_z))
 
 
 def arrival_grid(localiser: Localiser, grid_mm: Points3) -> NDArray[np.float64]:

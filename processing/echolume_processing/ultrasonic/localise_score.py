@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .localise import Places, localise, search_grid
+from .localise import Places, grid_around, localise
 from .localise_calibrate import calibrate
 from .recordings import Recordings
 
@@ -38,9 +38,10 @@ class Score:
 def score(recordings: Recordings) -> Score:
     """Calibrate on even-numbered recordings, localise in the odd ones."""
     even = np.arange(len(recordings.frames)) % 2 == 0
-    localiser = calibrate(recordings.chosen(even))
+    seen = recordings.chosen(even)
+    localiser = calibrate(seen)
     unseen = recordings.chosen(~even)
-    found = localise(localiser, unseen.frames, unseen.backgrounds, search_grid())
+    found = localise(localiser, unseen.frames, unseen.backgrounds, grid_around(seen.target_mm))
     away = found.place_mm - unseen.target_mm
     error = np.linalg.norm(away, axis=1)
     return Score(

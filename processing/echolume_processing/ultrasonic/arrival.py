@@ -37,7 +37,7 @@ class EchoModel:
     tempering: float = 0.6
     """Power of a channel's likelihood: its samples are not independent."""
     arrival_spread: float = 0.25
-    level_spread: float = 0.2
+    level_spread: float = 0.15
     """Standard deviations, in samples and as a logarithm, that the geometry leaves unexplained."""
     lost: float = 0.05
     """Probability that a channel does not hear the target."""

@@ -70,14 +70,14 @@ def synthetic(
 
 @pytest.fixture(scope="module")
 def calibrated() -> tuple[Recordings, localise.Localiser]:
-    seen = synthetic(60, np.array([2.25, 1.5, 2.0, 1.75]))
+    seen = synthetic(48, np.array([2.25, 1.5, 2.0, 1.75]))
     return seen, localise_calibrate.calibrate(seen)
 
 
 def test_imposed_delays_are_recovered(calibrated: tuple[Recordings, localise.Localiser]):
     # An offset along the axis acts as a delay of all channels: the arrivals, not the two apart, are determined.
     seen, localiser = calibrated
-    at, _ = localise.expected(localiser, seen.target_mm, np.zeros(60, dtype=np.intp))
+    at, _ = localise.expected(localiser, seen.target_mm, np.zeros(48, dtype=np.intp))
     imposed = localise.paths_mm(seen.target_mm, ELEMENTS) / 343.2e3 * 22e3 + np.array([2.25, 1.5, 2.0, 1.75])
     assert len(localiser.setups) == 1
     np.testing.assert_allclose(np.median(at - imposed, axis=0), 0.0, atol=0.15)
@@ -85,7 +85,7 @@ def test_imposed_delays_are_recovered(calibrated: tuple[Recordings, localise.Loc
 
 
 def test_an_imposed_sideways_offset_is_recovered():
-    seen = synthetic(60, np.full(4, 2.0), level=30.0, offset_mm=(8.0, -6.0, 0.0))
+    seen = synthetic(40, np.full(4, 2.0), level=30.0, offset_mm=(8.0, -6.0, 0.0))
     found = localise_calibrate.calibrate(seen)
     np.testing.assert_allclose(found.offset_mm[:2], [8.0, -6.0], atol=2.5)
 
@@ -107,7 +107,7 @@ def test_places_that_the_calibration_did_not_see_are_found(calibrated: tuple[Rec
 
 def test_the_stated_covariance_holds_the_error(calibrated: tuple[Recordings, localise.Localiser]):
     _, localiser = calibrated
-    held = synthetic(40, np.array([2.25, 1.5, 2.0, 1.75]), seed=21)
+    held = synthetic(30, np.array([2.25, 1.5, 2.0, 1.75]), seed=21)
     found = localise.localise(localiser, held.frames, held.backgrounds, GRID)
     away = found.place_mm - held.target_mm
     squares = np.einsum("ri,rij,rj->r", away, np.linalg.inv(found.covariance_mm2), away)
@@ -132,8 +132,8 @@ def test_a_deaf_channel_widens_the_covariance_and_leaves_the_place_near(
 
 
 def test_two_setups_are_told_apart_and_have_delays_of_their_own():
-    first = synthetic(40, np.array([2.0, 2.0, 2.0, 2.0]), seed=1, level=200.0)
-    second = synthetic(40, np.array([2.6, 2.0, 2.0, 2.0]), seed=2, level=200.0)
+    first = synthetic(24, np.array([2.0, 2.0, 2.0, 2.0]), seed=1, level=200.0)
+    second = synthetic(24, np.array([2.6, 2.0, 2.0, 2.0]), seed=2, level=200.0)
     both = Recordings(
         np.concatenate([first.frames, second.frames]),
         np.concatenate([first.backgrounds, second.backgrounds]),
@@ -144,7 +144,7 @@ def test_two_setups_are_told_apart_and_have_delays_of_their_own():
     means = setups.find_setups(both.backgrounds)
     label = setups.setup_of(both.backgrounds, means)
     assert len(means) == 2
-    assert len(set(label[:40])) == len(set(label[40:])) == 1
+    assert len(set(label[:24])) == len(set(label[24:])) == 1
     found = localise_calibrate.calibrate(both)
     late = setups.setup_of(both.backgrounds[-1:], found.setups)[0]
     assert found.delays[late, 0] - found.delays[1 - late, 0] == pytest.approx(0.6, abs=0.2)

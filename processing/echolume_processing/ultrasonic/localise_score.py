@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .localise import Places, grid_around, localise
 from .localise_calibrate import calibrate
@@ -59,6 +60,6 @@ def score(recordings: Recordings) -> Score:
     )
 
 
-def sigma_mm(places: Places) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def sigma_mm(places: Places) -> NDArray[np.float64]:
     """Stated 3D standard deviation of each place, (recordings,)."""
     return np.sqrt(np.trace(places.covariance_mm2, axis1=1, axis2=2))

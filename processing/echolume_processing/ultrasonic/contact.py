@@ -1,23 +1,20 @@
-"""Contact points from one emitter and N receivers: closed-form plane and point models, tested against each other.
+"""Contact points from one emitter and N receivers, ping by ping: plane and point models, tested against each other.
 
-All lengths are in mm, in a frame with the emitter at its origin and the receivers in the plane z = 0, z towards the
-scene. A path is emitter -> surface -> receiver.
+All lengths are in mm, in a frame with the emitter at its origin and z towards the scene. A path is emitter -> surface
+-> receiver. The arithmetic is that of `contacts`, for one ping.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from echolume_messages.geometry import Points3, require_shape
 from echolume_messages.types import EchoKind
-
-MIN_CHANNELS = 4
-SLIP_MM = 1.5
-"""A channel that lies this far from what all others agree on has slipped a cycle or seen another echo."""
+from echolume_processing.ultrasonic.contacts import MAX_CHI_SQUARED, MAX_TILT_RAD, Contacts, contacts, full
 
 
 @dataclass(frozen=True)
@@ -50,29 +47,38 @@ class Contact:
     """Receivers that the contact rests on, (receivers,)."""
     chi_squared: float
     """Per degree of freedom."""
+    batch: Contacts
+    """The whole result, of one ping."""
 
+    @property
+    def point_covariances(self) -> NDArray[np.float64]:
+        """Covariance of each contact point in mm^2, (receivers, 3, 3)."""
+        return full(self.batch.point_covariance[0])
 
-@lru_cache(maxsize=1024)
-def _inverse(receivers: bytes, used: bytes) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Pseudo-inverses of the plane's rows (-2x, -2y, 1) and constant columns of the point's (2x, 2y)."""
-    positions = np.frombuffer(receivers, dtype=np.float64).reshape(-1, 3)[np.frombuffer(used, dtype=np.bool_)]
-    rows = np.column_stack([-2 * positions[:, 0], -2 * positions[:, 1], np.ones(len(positions))])
-    return np.asarray(np.linalg.pinv(rows), dtype=np.float64), 2 * positions[:, :2]
+    @property
+    def normal_covariance(self) -> NDArray[np.float64]:
+        """Covariance of the normal, (3, 3), singular along it."""
+        return full(self.batch.normal_covariance[0])
+
+    @property
+    def foot_mm(self) -> NDArray[np.float64]:
+        """Foot of the perpendicular from the emitter on a plane, or the point, (3,)."""
+        return self.batch.foot_mm[0]
+
+    @property
+    def foot_covariance(self) -> NDArray[np.float64]:
+        """In mm^2, (3, 3)."""
+        return full(self.batch.foot_covariance[0])
 
 
 def fit_plane(receivers_mm: Points3, paths_mm: NDArray[np.float64], used: NDArray[np.bool_]) -> Plane | None:
     """Plane from path lengths in closed form; None where no plane has such paths.
 
     L_i^2 - |r_i|^2 = -2 r_i . E' + |E'|^2 is linear in E'x, E'y and |E'|^2, E' being the emitter's mirror image.
+    Receivers on a line, as in R-E-R, leave the tilt about that line open: it is taken as none.
     """
-    inverse, _ = _inverse(receivers_mm.tobytes(), used.tobytes())
-    squares = np.sum(receivers_mm**2, axis=1)
-    x, y, square = (float(v) for v in inverse @ (paths_mm[used] ** 2 - squares[used]))
-    depth = square - x * x - y * y
-    if not depth > 0:
-        return None
-    image = np.array([x, y, np.sqrt(depth)])
-    return Plane(image, np.linalg.norm(receivers_mm - image, axis=1))
+    foot = _foot(receivers_mm[used], paths_mm[used], "plane")
+    return None if foot is None else Plane(2 * foot, np.linalg.norm(receivers_mm - 2 * foot, axis=1))
 
 
 def fit_point(
@@ -82,59 +88,25 @@ def fit_point(
 
     2 r_i . P - 2 L_i R = |r_i|^2 - L_i^2 is linear in Px, Py and R = |P|.
     """
-    _, columns = _inverse(receivers_mm.tobytes(), used.tobytes())
-    lengths = paths_mm[used]
-    rows = np.column_stack([columns, -2 * lengths])
-    right = np.sum(receivers_mm[used] ** 2, axis=1) - lengths**2
-    try:
-        x, y, distance = (float(v) for v in np.linalg.solve(rows.T @ rows, rows.T @ right))
-    except np.linalg.LinAlgError:
+    point = _foot(receivers_mm[used], paths_mm[used], "point")
+    if point is None:
         return None
-    depth = distance * distance - x * x - y * y
-    if not (depth > 0 and distance > 0):
-        return None
-    point = np.array([x, y, np.sqrt(depth)])
-    return point, distance + np.linalg.norm(receivers_mm - point, axis=1)
+    return point, np.linalg.norm(point) + np.linalg.norm(receivers_mm - point, axis=1)
 
 
-def _chi_squared(
-    paths_mm: NDArray[np.float64],
-    predicted_mm: NDArray[np.float64],
-    sigma_mm: NDArray[np.float64],
-    used: NDArray[np.bool_],
-) -> float:
-    freedom = int(np.count_nonzero(used)) - 3
-    return float(np.sum(((paths_mm - predicted_mm)[used] / sigma_mm[used]) ** 2)) / max(freedom, 1)
-
-
-def without_slips(
-    receivers_mm: Points3, paths_mm: NDArray[np.float64], sigma_mm: NDArray[np.float64], used: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
-    """Leave out, one by one, channels that contradict the plane of all others (at most a quarter of them).
-
-    Notes
-    -----
-    Leaving one out and predicting it finds a slip that a fit to all channels would hide by tilting.
-    """
-    kept = used.copy()
-    for _ in range(int(np.count_nonzero(used)) // 4):
-        worst, gap = -1, 0.0
-        best = np.inf
-        for k in np.flatnonzero(kept):
-            others = kept.copy()
-            others[k] = False
-            if np.count_nonzero(others) < MIN_CHANNELS:
-                return kept
-            plane = fit_plane(receivers_mm, paths_mm, others)
-            if plane is None:
-                continue
-            score = _chi_squared(paths_mm, plane.paths_mm, sigma_mm, others)
-            if score < best:
-                best, worst, gap = score, int(k), float(abs(paths_mm[k] - plane.paths_mm[k]))
-        if worst < 0 or gap < max(SLIP_MM, 6.0 * float(sigma_mm[worst])):
-            return kept
-        kept[worst] = False
-    return kept
+def _foot(
+    receivers_mm: Points3, paths_mm: NDArray[np.float64], model: Literal["plane", "point"]
+) -> NDArray[np.float64] | None:
+    found = contacts(
+        receivers_mm,
+        paths_mm[None],
+        np.ones(len(receivers_mm)),
+        max_chi_squared=np.inf,
+        max_tilt_rad=0.5 * np.pi,
+        model=model,
+        untested=True,
+    )
+    return None if found.kind[0] == EchoKind.NONE else found.foot_mm[0].copy()
 
 
 def plane_contacts(plane: Plane, receivers_mm: Points3) -> Points3:
@@ -144,9 +116,12 @@ def plane_contacts(plane: Plane, receivers_mm: Points3) -> Points3:
 
 
 def axis_contacts(receivers_mm: Points3, paths_mm: NDArray[np.float64]) -> Points3:
-    """Contact points if the surface were perpendicular to the array's axis, (receivers, 3)."""
-    depth = 0.5 * np.sqrt(np.maximum(paths_mm**2 - np.sum(receivers_mm**2, axis=1), 0.0))
-    return np.column_stack([0.5 * receivers_mm[:, 0], 0.5 * receivers_mm[:, 1], depth])
+    """Contact points if the surface were perpendicular to the array's axis, (receivers, 3): on the bisector of the
+    ways to emitter and receiver."""
+    x, y, z = receivers_mm.T
+    deep = np.sqrt(np.maximum(paths_mm**2 - x**2 - y**2, 0.0))
+    share = 0.5 * (1 + np.divide(z, deep, out=np.zeros_like(deep), where=deep > 0))
+    return np.column_stack([share * x, share * y, 0.5 * (deep + z)])
 
 
 def contact(
@@ -154,8 +129,8 @@ def contact(
     paths_mm: NDArray[np.float64],
     sigma_mm: NDArray[np.float64],
     *,
-    max_chi_squared: float = 6.0,
-    max_tilt_rad: float = 0.45,
+    max_chi_squared: float = MAX_CHI_SQUARED,
+    max_tilt_rad: float = MAX_TILT_RAD,
 ) -> Contact:
     """Choose the model that explains a ping's path lengths, and give each receiver its contact point.
 
@@ -169,7 +144,7 @@ def contact(
     max_chi_squared : float
         Per degree of freedom; a model above it is not believed.
     max_tilt_rad : float
-        A plane tilted further than this off the array's axis cannot return its mirror image.
+        A target further than this off the array's axis cannot return an echo.
 
     Returns
     -------
@@ -178,36 +153,12 @@ def contact(
 
     Notes
     -----
-    A plane and a corner cannot be told apart from one pose.
+    See `contacts.contacts`.
     """
-    require_shape("receivers_mm", receivers_mm, (None, 3))
     require_shape("paths_mm", paths_mm, (len(receivers_mm),))
-    used = np.isfinite(paths_mm)
-    up = np.tile([0.0, 0.0, -1.0], (len(receivers_mm), 1))
-    alone = Contact(EchoKind.NONE, axis_contacts(receivers_mm, paths_mm), up, used, np.inf)
-    if np.count_nonzero(used) < MIN_CHANNELS:
-        return alone
-    kept = used
-    plane = fit_plane(receivers_mm, paths_mm, kept)
-    if plane is None or _chi_squared(paths_mm, plane.paths_mm, sigma_mm, kept) > max_chi_squared:
-        kept = without_slips(receivers_mm, paths_mm, sigma_mm, used)
-        plane = fit_plane(receivers_mm, paths_mm, kept)
-    point = fit_point(receivers_mm, paths_mm, kept)
-    plane_score = _chi_squared(paths_mm, plane.paths_mm, sigma_mm, kept) if plane is not None else np.inf
-    point_score = _chi_squared(paths_mm, point[1], sigma_mm, kept) if point is not None else np.inf
-    if (
-        plane is not None
-        and plane_score <= min(point_score, max_chi_squared)
-        and -plane.normal[2] >= np.cos(max_tilt_rad)
-    ):
-        normals = np.tile(plane.normal, (len(receivers_mm), 1))
-        return Contact(EchoKind.PLANE, plane_contacts(plane, receivers_mm), normals, kept, plane_score)
-    if (
-        point is not None
-        and point_score <= min(plane_score, max_chi_squared)
-        and point[0][2] >= np.cos(max_tilt_rad) * np.linalg.norm(point[0])
-    ):
-        normal = -point[0] / np.linalg.norm(point[0])
-        shape = (len(receivers_mm), 1)
-        return Contact(EchoKind.POINT, np.tile(point[0], shape), np.tile(normal, shape), kept, point_score)
-    return alone
+    require_shape("sigma_mm", sigma_mm, (len(receivers_mm),))
+    found = contacts(receivers_mm, paths_mm[None], sigma_mm, max_chi_squared=max_chi_squared, max_tilt_rad=max_tilt_rad)
+    kind = EchoKind(int(found.kind[0]))
+    scores = (np.inf, float(found.plane_chi_squared[0]), float(found.point_chi_squared[0]))
+    normals = np.tile(found.normals[0], (len(receivers_mm), 1))
+    return Contact(kind, found.points_mm[0], normals, found.used[0], scores[kind], found)

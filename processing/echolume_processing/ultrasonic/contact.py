@@ -160,5 +160,6 @@ def contact(
     found = contacts(receivers_mm, paths_mm[None], sigma_mm, max_chi_squared=max_chi_squared, max_tilt_rad=max_tilt_rad)
     kind = EchoKind(int(found.kind[0]))
     scores = (np.inf, float(found.plane_chi_squared[0]), float(found.point_chi_squared[0]))
-    normals = np.tile(found.normals[0], (len(receivers_mm), 1))
+    normals = np.empty(receivers_mm.shape)
+    normals[:] = found.normals[0]
     return Contact(kind, found.points_mm[0], normals, found.used[0], scores[kind], found)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import cos
 from typing import Literal
 
 import numpy as np
@@ -105,6 +106,7 @@ def contacts(
     max_tilt_rad: float = MAX_TILT_RAD,
     model: Literal["plane", "point", "both"] = "both",
     untested: bool = False,
+    leave_out: bool = True,
     rows: NDArray[np.float64] | None = None,
 ) -> Contacts:
     """Choose the model that explains each ping's path lengths, and give each receiver its contact point.
@@ -126,6 +128,8 @@ def contacts(
     untested : bool
         Believe the plane (or the point, if it alone is asked) where there are just enough paths to fit it and none to
         test it, as for R-E-R; else such pings are EchoKind.NONE.
+    leave_out : bool
+        Leave out channels that contradict all others.
     rows : (pings, 22 + 9 receivers) float64, optional
         Memory for the result.
 
@@ -144,16 +148,26 @@ def contacts(
     layout = layout_of(receivers_mm)
     n = len(layout.columns)
     require_shape("paths_mm", paths_mm, (None, n))
-    sigmas = np.ascontiguousarray(np.atleast_2d(sigma_mm), dtype=np.float64)
-    if sigmas.shape not in ((1, n), paths_mm.shape):
-        raise ValueError(f"sigma_mm: expected shape ({n},) or {paths_mm.shape}, got {np.shape(sigma_mm)}")
+    sigmas = np.ascontiguousarray(sigma_mm, dtype=np.float64)
+    if sigmas.shape == (n,):
+        sigmas = sigmas[None]
+    elif sigmas.shape != paths_mm.shape:
+        raise ValueError(f"sigma_mm: expected shape ({n},) or {paths_mm.shape}, got {sigmas.shape}")
     pings = len(paths_mm)
     width = at.POINTS + 9 * n
     if rows is None:
         rows = np.empty((pings, width))
-    require_shape("rows", rows, (pings, width))
+    elif rows.shape != (pings, width) or rows.dtype != np.float64 or not rows.flags.c_contiguous:
+        raise ValueError(f"rows: expected contiguous float64 of shape {(pings, width)}, got {rows.dtype} {rows.shape}")
     used = np.empty((pings, n), dtype=np.bool_)
-    limits = (max_chi_squared, SLIP_MM, SLIP_SIGMAS, float(np.cos(max_tilt_rad)), MODELS[model], float(untested))
+    limits = (
+        max_chi_squared,
+        SLIP_MM if leave_out else np.inf,
+        SLIP_SIGMAS,
+        cos(max_tilt_rad),
+        MODELS[model],
+        float(untested),
+    )
     contact_rows(
         layout.columns,
         layout.ridge,

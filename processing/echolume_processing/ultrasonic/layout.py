@@ -28,11 +28,8 @@ class Layout:
     """The kernel's: x, y, z, squared length, and x, y less their parts along `undetermined`; (receivers, 6)."""
     ridge: NDArray[np.float64]
     """The kernel's: what keeps the undetermined directions at no tilt, (6,)."""
-
-    @property
-    def deep(self) -> bool:
-        """Whether a receiver lies outside the plane z = 0 of the emitter."""
-        return bool(np.any(self.columns[:, 2] != 0))
+    deep: bool
+    """Whether a receiver lies outside the plane z = 0 of the emitter."""
 
 
 @lru_cache(maxsize=256)
@@ -55,7 +52,14 @@ def _analysed(data: bytes) -> Layout:
     upper = away[[0, 0, 1], [0, 1, 1]]
     columns = np.column_stack([receivers, np.sum(receivers**2, axis=1), kept])
     undetermined = np.column_stack([open_ways, np.zeros(len(open_ways))])
-    return Layout(receivers, 1 + rank, undetermined, columns, np.concatenate([size**2 * upper, upper]))
+    return Layout(
+        receivers,
+        1 + rank,
+        undetermined,
+        columns,
+        np.concatenate([size**2 * upper, upper]),
+        bool(np.any(receivers[:, 2])),
+    )
 
 
 def layout_of(receivers_mm: Points3) -> Layout:

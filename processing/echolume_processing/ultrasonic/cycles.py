@@ -1,0 +1,141 @@
+"""Cycle slips of all channels of a ping resolved together: the whole numbers of cycles that one surface explains."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations, product
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from echolume_messages.geometry import Points3, require_shape
+from echolume_messages.types import EchoKind
+from echolume_processing.ultrasonic.contacts import MAX_CHI_SQUARED, MAX_TILT_RAD, contacts
+
+SURE = 9.0
+"""By this much of chi-squared the best answer must beat the next."""
+MODELS: tuple[Literal["plane"], Literal["point"]] = ("plane", "point")
+
+
+@dataclass(frozen=True)
+class Cycles:
+    """Whole cycles that each channel was off, and how far to believe them."""
+
+    cycles: NDArray[np.int64]
+    """To be taken away from each channel, times the wavelength, (receivers,)."""
+    paths_mm: NDArray[np.float64]
+    """Without them, (receivers,)."""
+    kind: EchoKind
+    chi_squared: float
+    """Of the surface's fit to these paths, per degree of freedom."""
+    margin: float
+    """Chi-squared of the next best whole numbers above that of these."""
+
+    @property
+    def resolved(self) -> bool:
+        """Whether a surface explains the paths, and no other whole numbers do about as well."""
+        return self.kind != EchoKind.NONE and self.margin >= SURE
+
+
+def _pivots(receivers_mm: Points3, heard: NDArray[np.intp]) -> list[int]:
+    """Three channels that span the largest triangle."""
+
+    def area(three: tuple[int, ...]) -> float:
+        a, b, c = receivers_mm[list(three), :2]
+        return abs(float((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])))
+
+    best = max(combinations(heard.tolist(), 3), key=area)
+    if area(best) == 0:
+        raise ValueError("receivers_mm: expected three that are not on a line; a line cannot tell slips from tilts")
+    return list(best)
+
+
+def _candidates(
+    receivers_mm: Points3, paths_mm: NDArray[np.float64], wavelength_mm: float, most: int
+) -> NDArray[np.int64]:
+    """Whole numbers (candidates, receivers): any for three channels, what the surface through these says for the
+    others."""
+    heard = np.isfinite(paths_mm)
+    three = _pivots(receivers_mm, np.flatnonzero(heard))
+    tried = np.array(list(product(range(-most, most + 1), repeat=3)))  # (tried, 3)
+    ways = paths_mm[three] - wavelength_mm * tried
+    out = [np.zeros((1, len(paths_mm)), dtype=np.int64)]
+    for model in MODELS:
+        fit = contacts(receivers_mm[three], ways, np.ones(3), max_tilt_rad=MAX_TILT_RAD, model=model, untested=True)
+        target = fit.foot_mm[fit.kind != EchoKind.NONE]
+        if model == "plane":
+            base, target = np.zeros(len(target)), 2 * target
+        else:
+            base = np.linalg.norm(target, axis=1)
+        predicted = base[:, None] + np.linalg.norm(receivers_mm - target[:, None], axis=2)
+        cycles = np.where(heard, (paths_mm - predicted) / wavelength_mm, 0.0)
+        whole = np.rint(cycles).astype(np.int64)
+        out.append(whole[np.abs(whole).max(axis=1, initial=0) <= most])
+    return np.unique(np.concatenate(out), axis=0)
+
+
+def resolve_cycles(
+    receivers_mm: Points3,
+    paths_mm: NDArray[np.float64],
+    sigma_mm: NDArray[np.float64],
+    wavelength_mm: float,
+    envelope_mm: NDArray[np.float64],
+    envelope_sigma_mm: NDArray[np.float64],
+    *,
+    most: int = 1,
+) -> Cycles:
+    """Find the whole cycles of each channel that one plane or point and the envelopes explain best.
+
+    Parameters
+    ----------
+    receivers_mm : (receivers, 3) float64
+        Relative to the emitter.
+    paths_mm : (receivers,) float64
+        By phase: precise, but perhaps off by whole wavelengths; not a number where there is no echo.
+    sigma_mm : (receivers,) float64
+        Of the paths, slips apart.
+    wavelength_mm : float
+        What one slip adds to a path.
+    envelope_mm, envelope_sigma_mm : (receivers,) float64
+        Paths by envelope alone, and their sigma.
+    most : int
+        Cycles that a channel can be off.
+
+    Returns
+    -------
+    Cycles
+        `kind` NONE where no whole numbers make a surface: then a channel holds another echo.
+
+    Raises
+    ------
+    ValueError
+        If fewer than four channels have an echo (nothing would be left to test), or all of them are on a line.
+
+    Notes
+    -----
+    Three channels are given every combination, the surface through them gives the others theirs, and chi-squared of
+    surface and envelopes decides. A slip common to all channels, or one that grows evenly across the array like a
+    tilt, moves the surface and fits as well: only the envelopes decide about these, by the mean of all channels.
+    """
+    n = len(receivers_mm)
+    for name, values in (("paths_mm", paths_mm), ("sigma_mm", sigma_mm)):
+        require_shape(name, values, (n,))
+    for name, values in (("envelope_mm", envelope_mm), ("envelope_sigma_mm", envelope_sigma_mm)):
+        require_shape(name, values, (n,))
+    heard = int(np.count_nonzero(np.isfinite(paths_mm)))
+    if heard < 4:
+        raise ValueError(f"paths_mm: expected echoes of four channels at least, got {heard}")
+    whole = _candidates(receivers_mm, paths_mm, wavelength_mm, most)
+    ways = paths_mm - wavelength_mm * whole  # (candidates, receivers)
+    fits = contacts(receivers_mm, ways, sigma_mm, max_chi_squared=np.inf, leave_out=False)
+    surface = np.fmin(fits.plane_chi_squared, fits.point_chi_squared)
+    surface = np.where(fits.kind == EchoKind.NONE, np.inf, surface)
+    envelopes = np.nansum(((ways - envelope_mm) / envelope_sigma_mm) ** 2, axis=1)
+    score = (heard - 3) * surface + envelopes
+    order = np.argsort(score, kind="stable")
+    best = int(order[0])
+    margin = float(score[order[1]] - score[best]) if len(order) > 1 else np.inf
+    believed = bool(surface[best] <= MAX_CHI_SQUARED)
+    kind = EchoKind(int(fits.kind[best])) if believed else EchoKind.NONE
+    return Cycles(whole[best], ways[best], kind, float(surface[best]), margin)

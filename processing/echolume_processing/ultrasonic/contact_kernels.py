@@ -155,3 +155,29 @@ def refined(layout: Floats, ridge: Floats, length: Floats, weight: Floats, t: Tr
         return t
     d = times(c, g[0], g[1], g[2])
     return t[0] + d[0], t[1] + d[1], t[2] + d[2]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def with_common(layout: Floats, weight: Floats, t: Triple, point: bool, c: Six, variance: float) -> Six:
+    """Covariance of the target when all paths share one more error (sound's speed, the robot's pose)."""
+    base = np.sqrt(t[0] * t[0] + t[1] * t[1] + t[2] * t[2])
+    x = y = z = s = 0.0
+    for k in range(layout.shape[0]):
+        ax, ay, az = t[0] - layout[k, X], t[1] - layout[k, Y], t[2] - layout[k, H]
+        w = weight[k] / np.sqrt(ax * ax + ay * ay + az * az)
+        x += w * (t[0] - layout[k, OPEN_X])
+        y += w * (t[1] - layout[k, OPEN_Y])
+        z += w * az
+        s += weight[k]
+    if point:
+        s /= base
+        x, y, z = x + s * t[0], y + s * t[1], z + s * t[2]
+    x, y, z = times(c, x, y, z)
+    return (
+        c[0] + variance * x * x,
+        c[1] + variance * x * y,
+        c[2] + variance * x * z,
+        c[3] + variance * y * y,
+        c[4] + variance * y * z,
+        c[5] + variance * z * z,
+    )

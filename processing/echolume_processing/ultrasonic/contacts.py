@@ -102,6 +102,7 @@ def contacts(
     paths_mm: NDArray[np.float64],
     sigma_mm: NDArray[np.float64],
     *,
+    common_sigma_mm: float = 0.0,
     max_chi_squared: float = MAX_CHI_SQUARED,
     max_tilt_rad: float = MAX_TILT_RAD,
     model: Literal["plane", "point", "both"] = "both",
@@ -118,7 +119,9 @@ def contacts(
     paths_mm : (pings, receivers) float64
         Emitter, surface, receiver; not a number where a channel has no echo.
     sigma_mm : (receivers,) or (pings, receivers) float64
-        Standard deviation of the paths; channels weigh by it.
+        Standard deviation of each path for itself; channels weigh by it.
+    common_sigma_mm : float
+        Of what all paths of a ping share: sound's speed, the robot's pose. It widens the covariances only.
     max_chi_squared : float
         Per degree of freedom; a model above it is not believed.
     max_tilt_rad : float
@@ -167,6 +170,7 @@ def contacts(
         cos(max_tilt_rad),
         MODELS[model],
         float(untested),
+        common_sigma_mm,
     )
     contact_rows(
         layout.columns,

@@ -31,10 +31,11 @@ from echolume_processing.ultrasonic.contact_kernels import (
     inverse,
     refined,
     times,
+    with_common,
 )
 from echolume_processing.ultrasonic.slip_kernels import contradiction
 
-MAX_CHI, SLIP_MM, SLIP_SIGMAS, MIN_COSINE, ALLOWED, ASSUME = 0, 1, 2, 3, 4, 5
+MAX_CHI, SLIP_MM, SLIP_SIGMAS, MIN_COSINE, ALLOWED, ASSUME, COMMON_MM = 0, 1, 2, 3, 4, 5, 6
 """What the settings of a batch are. `ALLOWED`: 1 plane, 2 point, 3 both; `ASSUME`: believe a plane where the paths are
 too few to test one."""
 MOST_SLIPS = 2
@@ -217,6 +218,8 @@ def contact_rows(
         t = plane if is_plane else point
         fisher, _ = information(layout, ridge, length, weight, t, is_point)
         c6, _ = inverse(fisher)
+        if settings[COMMON_MM] > 0.0:
+            c6 = with_common(layout, weight, t, is_point, c6, settings[COMMON_MM] * settings[COMMON_MM])
         row[KIND], row[RANK] = PLANE if is_plane else POINT, rank
         write_normal(row, t, c6)
         if is_plane:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from echolume_messages.geometry import Matrix, Points3, rotation_from_vector, transform
+from echolume_messages.geometry import Points3, rotation_from_vector, transform
 from echolume_processing.ultrasonic.contacts import MAX_CHI_SQUARED
 from echolume_processing.ultrasonic.primitives import PARAMETERS, WIDER, SurfaceKind
 from echolume_processing.ultrasonic.surface_fit import Fit, Scan, best_fit, feet_of, scan_of
@@ -121,24 +121,22 @@ def _chosen(fits: dict[SurfaceKind, Fit], max_chi_squared: float) -> Surface:
 
 @dataclass(frozen=True)
 class Motion:
-    """A motion of the array, and what it would tell."""
+    """Further poses of the array, and what they would tell."""
 
     name: str
-    emitter_from_moved: Matrix
+    emitter_from_moved: NDArray[np.float64]
+    """(poses, 4, 4), from the frame of the last pose."""
     sigmas: float
-    """By which the rival would fail to explain the ping there."""
+    """By which the rival would fail to explain the pings there; below 3 they do not tell."""
 
 
-def motions(step_mm: float, turn_rad: float) -> dict[str, Matrix]:
-    """Steps and turns of the array in its own frame, by name."""
-    out: dict[str, Matrix] = {}
-    for axis, name in enumerate("xyz"):
-        for sign, word in ((1.0, "+"), (-1.0, "-")):
-            unit = sign * np.eye(3)[axis]
-            out[f"step {word}{name}"] = transform(np.eye(3), step_mm * unit)
-            if name != "z":
-                out[f"turn {word}{name}"] = transform(rotation_from_vector(turn_rad * unit), np.zeros(3))
-    return out
+def motions(step_mm: float, turn_rad: float) -> dict[str, NDArray[np.float64]]:
+    """Steps along and turns about the array's own axes, and two steps across, by name."""
+    axes = np.eye(3)
+    steps = [transform(axes, step_mm * axis) for axis in axes]
+    turns = [transform(rotation_from_vector(turn_rad * axis), np.zeros(3)) for axis in axes[:2]]
+    alone = dict(zip(("step x", "step y", "step z", "turn x", "turn y"), (*steps, *turns), strict=True))
+    return {name: move[None] for name, move in alone.items()} | {"steps x and y": np.array(steps[:2])}
 
 
 def separating_motions(
@@ -147,9 +145,9 @@ def separating_motions(
     rig_from_emitter: NDArray[np.float64],
     receivers_mm: Points3,
     sigma_mm: NDArray[np.float64],
-    candidates: Mapping[str, Matrix],
+    candidates: Mapping[str, NDArray[np.float64]],
 ) -> list[Motion]:
-    """Which motion from the last pose would tell the chosen kind from a rival, best first.
+    """Which motion from the last pose would exclude a rival if the chosen kind is right, best first.
 
     Parameters
     ----------
@@ -162,17 +160,17 @@ def separating_motions(
     receivers_mm : (receivers, 3) float64
     sigma_mm : (receivers,) float64
         Of a ping's paths.
-    candidates : mapping
-        Motions in the array's frame, as of `motions`.
+    candidates : mapping of (poses, 4, 4) float64
+        In the array's frame, as of `motions`.
 
     Notes
     -----
-    The chosen kind predicts the paths of all poses and of the new one; what the rival, fitted again to these, leaves
+    The chosen kind predicts the paths of all poses and of the new ones; what the rival, fitted again to these, leaves
     unexplained is what the motion would show.
     """
     out: list[Motion] = []
     for name, moved in candidates.items():
-        poses = np.concatenate([rig_from_emitter, (rig_from_emitter[-1] @ moved)[None]])
+        poses = np.concatenate([rig_from_emitter, rig_from_emitter[-1] @ moved])
         shape = (len(poses), len(receivers_mm))
         rows = scan_of(poses, receivers_mm, np.ones(shape), np.broadcast_to(sigma_mm, shape))
         paths_mm = surface.best.primitive.paths_mm(rows.emitter_mm, rows.receiver_mm)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from echolume_drivers.emulated.array_truth import array_truth
@@ -32,7 +32,7 @@ PINGS = 2000
 
 def images_of(rng: np.random.Generator, pings: int = PINGS, tilt: float = 0.1) -> np.ndarray:
     """Emitter's images in planes at 400 mm, (pings, 3)."""
-    normals = np.column_stack([rng.normal(0, tilt, (pings, 2)), np.ones(pings)])
+    normals = np.column_stack([rng.uniform(-2 * tilt, 2 * tilt, (pings, 2)), np.ones(pings)])
     return 2 * DISTANCE_MM * normals / np.linalg.norm(normals, axis=1)[:, None]
 
 
@@ -122,7 +122,8 @@ def test_planes_and_points_are_recovered_by_random_layouts_in_space(seed: int, r
     rng = np.random.default_rng(seed)
     receivers = rng.uniform(-60, 60, (receivers_count, 3)) * [1, 1, rng.choice([0.0, 0.02, 0.5])]
     receivers += [0, 0, rng.choice([0.0, -40.0])]  # the emitter ahead of its receivers
-    image = images_of(rng, 1, 0.15)
+    assume(np.linalg.svd(receivers[:, :2] - receivers[:, :2].mean(axis=0))[1][1] > 20)  # spread both ways
+    image = images_of(rng, 1, 0.14)
     sigma = np.full(receivers_count, 1e-6)
     flat = contacts(receivers, plane_paths(image, receivers), sigma, model="plane", max_chi_squared=1e4)
     assert flat.kind[0] == EchoKind.PLANE
@@ -219,7 +220,7 @@ def test_missing_channels_are_done_without_and_their_absence_is_in_the_covarianc
     paths = plane_paths(images) + rng.normal(0, SIGMA_MM, (PINGS, 8))
     missing = np.argsort(rng.random((PINGS, 8)), axis=1) < 2
     paths[missing] = np.nan
-    found = contacts(GRID, paths, np.full(8, SIGMA_MM), model="plane")
+    found = contacts(GRID, paths, np.full(8, SIGMA_MM), model="plane", max_chi_squared=np.inf)
     np.testing.assert_array_equal(found.used, ~missing)
     assert nees(found.foot_mm - images / 2, full(found.foot_covariance)) == pytest.approx(1, abs=0.06)
     assert np.isfinite(found.points_mm).all()
@@ -254,8 +255,7 @@ def test_slips_of_any_one_or_two_channels_are_left_out(slips: int, paths_of: obj
     assert right.mean() > (0.999 if slips == 1 else 0.99)
     if paths_of is plane_paths and slips == 1:
         assert np.sqrt(np.mean(angle_deg(found.normals, images)[right] ** 2)) < 0.06
-    wrong = found.kind[~right]
-    assert np.mean(np.isin(wrong, [EchoKind.NONE])) > 0.5 or len(wrong) == 0
+    assert np.count_nonzero(~right & (found.kind != EchoKind.NONE)) <= 0.002 * PINGS
 
 
 def test_leaving_one_out_by_the_hat_matrix_is_refitting():
@@ -437,9 +437,8 @@ def pipeline() -> UltrasonicPipeline:
 def tilted() -> list[Ping]:
     """Pings over the plate at four heights and random tilts up to 12 degrees about both axes."""
     rng = np.random.default_rng(2)
-    poses = [(*rng.uniform(-40, 40, 2), z, *rng.uniform(-12, 12, 2), 0.0) for z in (110.0, 150.0, 200.0, 250.0)] * 1
-    more = [(*rng.uniform(-40, 40, 2), z, *rng.uniform(-12, 12, 2), 0.0) for z in (110.0, 150.0, 200.0, 250.0) * 5]
-    return take([*poses, *more], 3)
+    poses = [(*rng.uniform(-40, 40, 2), z, *rng.uniform(-12, 12, 2), 0.0) for z in (110.0, 150.0, 200.0, 250.0) * 6]
+    return take(poses, 3)
 
 
 def test_contacts_of_emulated_pings_are_as_good_as_they_say(pipeline: UltrasonicPipeline, tilted: list[Ping]):

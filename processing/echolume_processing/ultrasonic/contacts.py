@@ -151,7 +151,7 @@ def contacts(
     layout = layout_of(receivers_mm)
     n = len(layout.columns)
     require_shape("paths_mm", paths_mm, (None, n))
-    sigmas = np.ascontiguousarray(sigma_mm, dtype=np.float64)
+    sigmas = _writable(sigma_mm)
     if sigmas.shape == (n,):
         sigmas = sigmas[None]
     elif sigmas.shape != paths_mm.shape:
@@ -178,7 +178,7 @@ def contacts(
         layout.rank,
         layout.deep,
         np.array(limits),
-        np.ascontiguousarray(paths_mm, dtype=np.float64),
+        _writable(paths_mm),
         sigmas,
         used,
         rows,
@@ -187,6 +187,12 @@ def contacts(
     if layout.rank < 3:
         _open_up(found)
     return found
+
+
+def _writable(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """As the kernel takes arrays, which must not be read-only."""
+    out = np.ascontiguousarray(values, dtype=np.float64)
+    return out if out.flags.writeable else out.copy()
 
 
 def _open_up(found: Contacts) -> None:

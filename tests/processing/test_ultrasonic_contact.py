@@ -271,6 +271,19 @@ def test_leaving_one_out_by_the_hat_matrix_is_refitting():
     assert found.chi_squared == pytest.approx(refitted.chi_squared, rel=1e-6)
 
 
+def test_echoes_of_another_surface_60_mm_nearer_are_left_out_though_no_plane_has_such_paths():
+    rng = np.random.default_rng(19)
+    receivers = 0.4 * GRID
+    images = images_of(rng, tilt=0.05) * 150 / DISTANCE_MM
+    other = np.argsort(rng.random((PINGS, 8)), axis=1) < 2
+    paths = plane_paths(images, receivers) + rng.normal(0, 0.05, (PINGS, 8)) - 60 * other
+    found = contacts(receivers, paths, np.full(8, 0.05))
+    assert sum(fit_plane(receivers, path, np.ones(8, bool)) is None for path in paths[:100]) > 30
+    right = (found.used == ~other).all(axis=1) & (found.kind == EchoKind.PLANE)
+    assert right.mean() > 0.999
+    assert not np.any((found.kind != EchoKind.NONE) & ~right)
+
+
 def test_of_four_channels_none_can_be_left_out():
     paths = plane_paths(images_of(np.random.default_rng(10), 1))[:, [0, 2, 5, 7]]
     paths[0, 1] += WAVELENGTH_MM
@@ -321,6 +334,15 @@ def test_one_ping_is_a_batch_of_one_and_a_fit_a_batch_without_a_test():
     assert point is not None
     np.testing.assert_allclose(plane.image_mm / 2, batch.foot_mm[0], atol=1e-9)
     assert np.linalg.norm(point[0] - batch.foot_mm[0]) > 0.1
+
+
+def test_read_only_and_single_precision_paths_are_taken():
+    paths = plane_paths(images_of(np.random.default_rng(20), 3))
+    paths.flags.writeable = False
+    found = contacts(GRID, paths, np.broadcast_to(0.1, paths.shape))
+    single = contacts(GRID, paths.astype(np.float32), np.full(8, 0.1, dtype=np.float32))
+    assert found.points_mm.dtype == single.points_mm.dtype == np.float64
+    np.testing.assert_allclose(single.points_mm, found.points_mm, atol=0.01)
 
 
 def test_wrong_shapes_are_named():

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Triple = tuple[float, float, float]
+Four = tuple[float, float, float, float]
 Six = tuple[float, float, float, float, float, float]
 
 NONE, PLANE, POINT = 0, 1, 2
@@ -65,8 +66,20 @@ def target(u: Triple, v: Triple, point: bool) -> Triple:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def fit_both(layout: Floats, ridge: Floats, length: Floats, weight: Floats) -> tuple[Triple, Six, Triple, Six]:
-    """Target and inverse normal matrix of the plane, then of the point; weights are 1 / sigma^2, 0 where missing."""
+def along(u: Triple, v: Triple, t: float, otherwise: float, good: bool) -> Four:
+    """The unknowns (a, b, g) at a depth, or at another if there is none, and that depth; not numbers if not good."""
+    d = otherwise if np.isnan(t) else t
+    return (u[0] + d * v[0] if good else np.nan), u[1] + d * v[1], u[2] + d * v[2], d
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def fit_both(
+    layout: Floats, ridge: Floats, length: Floats, weight: Floats
+) -> tuple[Triple, Six, Four, Triple, Six, Four]:
+    """Target, inverse normal matrix and unknowns of the plane, then of the point.
+
+    Weights are 1 / sigma^2, 0 where missing. The unknowns exist where paths that contradict each other have no target.
+    """
     xx = xy = yy = x1 = y1 = s1 = xl = yl = ll = sl = 0.0
     xb = yb = b1 = bl = xh = yh = h1 = hl = 0.0
     for k in range(layout.shape[0]):
@@ -98,10 +111,13 @@ def fit_both(layout: Floats, ridge: Floats, length: Floats, weight: Floats) -> t
     yy += ridge[2] * s1
     m, plane_ok = inverse((xx, xy, x1, yy, y1, s1))
     p, point_ok = inverse((xx, xy, xl, yy, yl, ll))
-    plane = target(times(m, xb, yb, b1), times(m, xh, yh, h1), False)
-    point = target(times(p, xb, yb, bl), times(p, xh, yh, hl), True)
+    u, v = times(m, xb, yb, b1), times(m, xh, yh, h1)
+    o, q = times(p, xb, yb, bl), times(p, xh, yh, hl)
     none = (np.nan, np.nan, np.nan)
-    return plane if plane_ok else none, m, point if point_ok else none, p
+    plane = target(u, v, False) if plane_ok else none
+    point = target(o, q, True) if point_ok else none
+    mean = sl / s1
+    return plane, m, along(u, v, plane[2], mean, plane_ok), point, p, along(o, q, point[2], 0.5 * mean, point_ok)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})

@@ -20,6 +20,7 @@ from echolume_processing.ultrasonic.contact_kernels import (
     TARGET,
     Flags,
     Floats,
+    Four,
     H,
     Six,
     Triple,
@@ -128,15 +129,15 @@ def write_none(row: Floats, layout: Floats, paths: Floats, some: bool) -> None:
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def both(
     layout: Floats, ridge: Floats, length: Floats, weight: Floats, deep: bool
-) -> tuple[Triple, Six, float, Triple, Six, float]:
-    """Target, inverse normal matrix and chi-squared of the plane, then of the point."""
-    plane, m, point, p = fit_both(layout, ridge, length, weight)
+) -> tuple[Triple, Six, Four, float, Triple, Six, Four, float]:
+    """Target, inverse normal matrix, unknowns and chi-squared of the plane, then of the point."""
+    plane, m, u, point, p, v = fit_both(layout, ridge, length, weight)
     if deep:
         plane = refined(layout, ridge, length, weight, plane, False)
         point = refined(layout, ridge, length, weight, point, True)
     plane_chi = chi_squared(layout, length, weight, plane, False)
     point_chi = chi_squared(layout, length, weight, point, True)
-    return plane, m, plane_chi, point, p, point_chi
+    return plane, m, u, plane_chi, point, p, v, point_chi
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
@@ -184,13 +185,13 @@ def contact_rows(
         if freedom < 0 or (freedom == 0 and settings[ASSUME] == 0.0):
             write_none(row, layout, paths[i], count > 0)
             continue
-        plane, m, plane_chi, point, p, point_chi = both(layout, ridge, length, weight, deep)
+        plane, m, u, plane_chi, point, p, v, point_chi = both(layout, ridge, length, weight, deep)
         least = max_chi * freedom
         if freedom > 0 and not plane_chi <= least and not (allowed > PLANE and point_chi <= least):
             most = min(MOST_SLIPS, count // 4)
-            a, b, chi = contradiction(layout, length, weight, plane, m, False, freedom, most, settings)
+            a, b, chi = contradiction(layout, length, weight, u, m, False, freedom, most, settings)
             if allowed >= POINT:
-                c, d, other = contradiction(layout, length, weight, point, p, True, freedom, most, settings)
+                c, d, other = contradiction(layout, length, weight, v, p, True, freedom, most, settings)
                 if c >= 0 and (a < 0 or (b >= 0 and d < 0) or ((b >= 0) == (d >= 0) and other < chi)):
                     a, b = c, d
             if a >= 0:
@@ -199,7 +200,7 @@ def contact_rows(
                 if b >= 0:
                     weight[b], used[i, b] = 0.0, False
                     freedom -= 1
-                plane, m, plane_chi, point, p, point_chi = both(layout, ridge, length, weight, deep)
+                plane, m, u, plane_chi, point, p, v, point_chi = both(layout, ridge, length, weight, deep)
         if freedom == 0:
             plane_chi = 0.0 if allowed != POINT and plane[2] > 0.0 else np.nan
             point_chi = 0.0 if allowed == POINT and point[2] > 0.0 else np.nan

@@ -11,11 +11,9 @@ from echolume_processing.ultrasonic.contact_kernels import (
     SQUARE,
     SURE,
     Floats,
+    Four,
     H,
     Six,
-    Triple,
-    X,
-    Y,
     times,
 )
 
@@ -25,21 +23,19 @@ Left = tuple[int, int, float]
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def hat_rows(
-    layout: Floats, length: Floats, weight: Floats, t: Triple, m: Six, point: bool, a: Floats, b: Floats, e: Floats
+    layout: Floats, length: Floats, weight: Floats, u: Four, m: Six, point: bool, a: Floats, b: Floats, e: Floats
 ) -> float:
     """Fill, for each channel, its scaled row (n, 3), the inverse normal matrix times it (n, 3), and its residual (n,)
     in sigmas of path; returns the residuals' sum of squares."""
-    square = t[0] * t[0] + t[1] * t[1] + t[2] * t[2]
-    g = 2.0 * np.sqrt(square) if point else square
     unit = 1.0 if point else 0.5  # a residual of the equation is the path's times 2 L for a plane, about L for a point
     total = 0.0
     for k in range(layout.shape[0]):
         root = np.sqrt(weight[k]) / length[k]
-        c = length[k] if point else 1.0
-        a[k, 0], a[k, 1], a[k, 2] = root * layout[k, OPEN_X], root * layout[k, OPEN_Y], root * c
+        x, y, c = layout[k, OPEN_X], layout[k, OPEN_Y], (length[k] if point else 1.0)
+        a[k, 0], a[k, 1], a[k, 2] = root * x, root * y, root * c
         b[k, 0], b[k, 1], b[k, 2] = times(m, a[k, 0], a[k, 1], a[k, 2])
-        along = layout[k, X] * t[0] + layout[k, Y] * t[1] + layout[k, H] * t[2]
-        e[k] = unit * root * (length[k] * length[k] - layout[k, SQUARE] + 2.0 * along - g * c)
+        known = length[k] * length[k] - layout[k, SQUARE] + 2.0 * layout[k, H] * u[3]
+        e[k] = unit * root * (known - x * u[0] - y * u[1] - c * u[2])
         total += e[k] * e[k]
     return total
 
@@ -49,7 +45,7 @@ def contradiction(
     layout: Floats,
     length: Floats,
     weight: Floats,
-    t: Triple,
+    u: Four,
     m: Six,
     point: bool,
     freedom: int,
@@ -62,10 +58,10 @@ def contradiction(
     """
     n = layout.shape[0]
     nobody = (-1, -1, np.inf)
-    if np.isnan(t[2]):
+    if np.isnan(u[0]):
         return nobody
     a, b, e = np.empty((n, 3)), np.empty((n, 3)), np.empty(n)
-    total = hat_rows(layout, length, weight, t, m, point, a, b, e)
+    total = hat_rows(layout, length, weight, u, m, point, a, b, e)
     if most >= 1 and freedom >= 2:
         best, second, at, off = np.inf, np.inf, -1, 0.0
         for k in range(n):

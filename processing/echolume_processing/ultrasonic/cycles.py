@@ -71,7 +71,7 @@ def _candidates(
         predicted = base[:, None] + np.linalg.norm(receivers_mm - target[:, None], axis=2)
         cycles = np.where(heard, (paths_mm - predicted) / wavelength_mm, 0.0)
         whole = np.rint(cycles).astype(np.int64)
-        out.append(whole[np.abs(whole).max(axis=1, initial=0) <= most])
+        out.append(whole)
     return np.unique(np.concatenate(out), axis=0)
 
 
@@ -83,7 +83,7 @@ def resolve_cycles(
     envelope_mm: NDArray[np.float64],
     envelope_sigma_mm: NDArray[np.float64],
     *,
-    most: int = 1,
+    most: int = 2,
 ) -> Cycles:
     """Find the whole cycles of each channel that one plane or point and the envelopes explain best.
 
@@ -100,7 +100,7 @@ def resolve_cycles(
     envelope_mm, envelope_sigma_mm : (receivers,) float64
         Paths by envelope alone, and their sigma.
     most : int
-        Cycles that a channel can be off.
+        Cycles that each of the three channels tried can be off; the others may be off by any number.
 
     Returns
     -------

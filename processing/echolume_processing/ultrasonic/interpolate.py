@@ -17,8 +17,9 @@ from echolume_processing.ultrasonic.raster import Raster, raster_over, require_s
 
 DepthMap: TypeAlias = NDArray[np.float64]
 Interpolation = Literal["nearest", "linear", "natural"]
-FINER = 3
-"""Discrete natural neighbours are found on a raster so many times finer."""
+FINER = 4
+"""Discrete natural neighbours are found on a raster so many times finer; even, so that the centres of fine pixels keep
+off the lines between the points of a raster."""
 
 
 def interpolate_nearest(points_mm: Points3, raster: Raster) -> DepthMap:
@@ -94,7 +95,7 @@ def interpolate_natural(points_mm: Points3, raster: Raster) -> DepthMap:
 
     Notes
     -----
-    The weights are counted on a raster three times finer, so a plane is reproduced to about a tenth of the pixel times
+    The weights are counted on a raster four times finer, so a plane is reproduced to about a tenth of the pixel times
     its slope. Outside the hull of the points the heights run level.
 
     References
@@ -107,15 +108,18 @@ def interpolate_natural(points_mm: Points3, raster: Raster) -> DepthMap:
     reach = np.asarray(tree.query(raster.centres().reshape(-1, 2))[0], dtype=np.float64).max()
     rim = int(np.ceil(reach / raster.pixel_mm)) + 1
     fine = raster.pixel_mm / FINER
-    x = raster.x0_mm + fine * (np.arange((raster.columns + 2 * rim) * FINER) - rim * FINER - FINER // 2)
-    y = raster.y0_mm + fine * (np.arange((raster.rows + 2 * rim) * FINER) - rim * FINER - FINER // 2)
+    middle = rim * FINER + 0.5 * (FINER - 1)
+    x = raster.x0_mm + fine * (np.arange((raster.columns + 2 * rim) * FINER) - middle)
+    y = raster.y0_mm + fine * (np.arange((raster.rows + 2 * rim) * FINER) - middle)
     distance, nearest = tree.query(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
     shape = len(y), len(x)
-    return scatter_natural(
+    found = scatter_natural(
         np.asarray(distance, dtype=np.float64).reshape(shape) / raster.pixel_mm,
         points_mm[np.asarray(nearest), 2].reshape(shape),
         rim, raster.rows, raster.columns,
     )  # fmt: skip
+    # Points closer together than the fine pixels may have none of their own.
+    return np.where(np.isfinite(found), found, interpolate_nearest(points_mm, raster))
 
 
 @numba.njit(cache=True)
@@ -125,17 +129,17 @@ def scatter_natural(
     """Mean height (rows, columns) of the fine pixels whose reach covers each pixel; `rim` pixels lie around."""
     total, count = np.zeros((rows, columns)), np.zeros((rows, columns))
     for j in range(reach_px.shape[0]):
-        y = (j - FINER // 2) / FINER - rim
+        y = (j + 0.5) / FINER - 0.5 - rim
         for i in range(reach_px.shape[1]):
-            x = (i - FINER // 2) / FINER - rim
-            # Ties belong to the point itself; a pixel on a point takes over nothing but the fine pixel that it stands on.
-            reach = max(reach_px[j, i] * (1 - 1e-9), 0.5 / FINER)
+            x = (i + 0.5) / FINER - 0.5 - rim
+            # Its own point lies exactly at its reach.
+            reach = reach_px[j, i] * (1 + 1e-9)
             for row in range(max(0, int(np.ceil(y - reach))), min(rows, int(np.floor(y + reach)) + 1)):
                 wide = np.sqrt(max(reach * reach - (row - y) ** 2, 0.0))
                 for column in range(max(0, int(np.ceil(x - wide))), min(columns, int(np.floor(x + wide)) + 1)):
                     total[row, column] += heights_mm[j, i]
                     count[row, column] += 1
-    return total / np.maximum(count, 1)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 INTERPOLATIONS: Mapping[Interpolation, Callable[[Points3, Raster], DepthMap]] = {

@@ -20,7 +20,7 @@ from echolume_processing.ultrasonic.voxels import Volume
 
 DPI = 110
 HEIGHTS, LEVELS = "viridis", "magma"
-FLOOR_DB = -30.0
+FLOOR_DB = -24.0
 SLICES = 6
 
 
@@ -93,9 +93,7 @@ def _interpolated(images: Images) -> Figure:
     last = panels[1, 1]
     drawn = _show(last, images.gray, images.raster, "gray", (0, 255))
     last.set_title(
-        f"Gray levels of the {images.chosen} one: {images.scale.resolution_mm:.3g} mm each, pixels of "
-        f"{images.raster.pixel_mm:g} mm",
-        fontsize="medium",
+        f"Gray levels, {images.chosen}: {images.scale.resolution_mm:.3g} mm, pixel {images.raster.pixel_mm:g} mm"
     )
     figure.colorbar(drawn, ax=last, shrink=0.8, label="level")
     return figure
@@ -126,6 +124,8 @@ def _edges(images: Images) -> Figure:
         space.plot(x, y, z, color="tab:orange", linewidth=1.5)
         for end, covariance in zip(edge.ends_mm, edge.covariance_mm2, strict=True):
             flat.add_patch(_ellipse(end, covariance))
+    flat.set_xlim(*_extent(images.raster)[:2])
+    flat.set_ylim(*_extent(images.raster)[2:])
     return figure
 
 
@@ -158,12 +158,12 @@ def _projections(volume: Volume) -> Figure:
     """Largest values along each axis, as they are and weighted with the coherence factor."""
     grid = volume.grid
     weighted = (False, True) if volume.coherence is not None else (False,)
-    figure = Figure(figsize=(15, 4.8 * len(weighted)), dpi=DPI, layout="constrained")
-    panels = figure.subplots(len(weighted), 3, squeeze=False, width_ratios=(1, 1, 1))
+    figure = Figure(figsize=(15, 4.4 * len(weighted)), dpi=DPI, layout="constrained")
+    panels = figure.subplots(len(weighted), 3, squeeze=False)
     for row, with_coherence in zip(panels, weighted, strict=True):
         values = volume.magnitude(weighted=with_coherence)
         reference = max(float(values.max()), 1e-12)
-        name = "delay-and-sum x coherence" if with_coherence else f"delay-and-sum ({volume.method})"
+        name = "Delay-and-sum x coherence" if with_coherence else f"Delay-and-sum ({volume.method})"
         drawn: Any = None
         views = ((0, grid.x_mm, grid.y_mm, "xy"), (1, grid.x_mm, grid.z_mm, "xz"), (2, grid.y_mm, grid.z_mm, "yz"))
         for axes, (axis, across, up, names) in zip(row, views, strict=True):
@@ -174,18 +174,24 @@ def _projections(volume: Volume) -> Figure:
 
 
 def _slices(volume: Volume) -> Figure:
-    """Level slices from the lowest bright one to the highest."""
-    grid, values = volume.grid, volume.magnitude(weighted=volume.coherence is not None)
-    peaks = values.max(axis=(1, 2))
-    bright = np.flatnonzero(peaks >= 10 ** (FLOOR_DB / 40) * max(float(peaks.max()), 1e-12))
-    shown = np.unique(np.linspace(bright[0], bright[-1], SLICES).round().astype(int))
+    """Level slices at the heights where most comes back."""
+    grid, values = volume.grid, volume.magnitude()
+    profile = np.sqrt(np.mean(values.astype(np.float64) ** 2, axis=(1, 2)))
     figure = Figure(figsize=(14, 8.6), dpi=DPI, layout="constrained")
     panels = figure.subplots(2, SLICES // 2)
+    shown = _crests(profile)
     for axes in panels.flat[len(shown) :]:
         axes.set_axis_off()
     drawn: Any = None
     for axes, k in zip(panels.flat, shown, strict=False):
-        found = _decibels(values[k], float(peaks.max()))
+        found = _decibels(values[k], max(float(values.max()), 1e-12))
         drawn = _panel(axes, found, grid.x_mm, grid.y_mm, "xy", f"z = {grid.z_mm[k]:.1f} mm")
     figure.colorbar(drawn, ax=panels.ravel().tolist(), shrink=0.7, label="dB")
     return figure
+
+
+def _crests(profile: NDArray[np.float64]) -> NDArray[np.int64]:
+    """The highest local maxima of a profile (n,), in order; what is highest besides where there are too few."""
+    padded = np.pad(profile, 1, constant_values=-np.inf)
+    crest = (profile > padded[:-2]) & (profile >= padded[2:])
+    return np.sort(np.lexsort((-profile, ~crest))[:SLICES])

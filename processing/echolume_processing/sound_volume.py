@@ -7,17 +7,22 @@ from pathlib import Path
 
 import numpy as np
 
+from echolume_messages.errors import ConfigError
 from echolume_messages.geometry import Points3, apply, invert
 from echolume_processing.sound_images import Images
 from echolume_processing.sound_scan import Progress, SoundScan
 from echolume_processing.ultrasonic.delay_and_sum import Method, delay_and_sum, silent
 from echolume_processing.ultrasonic.gated import gate_pings
 from echolume_processing.ultrasonic.pipeline import MIN_PATH_MM, speed_of_sound_mps
+from echolume_processing.ultrasonic.raster import spacing_mm
 from echolume_processing.ultrasonic.scan_lattice import IrregularScanError, grid_over, scan_lattice
 from echolume_processing.ultrasonic.voxels import Volume, VoxelGrid
 
 BELOW_MM, ABOVE_MM = 15.0, 20.0
 """The volume reaches so far below and above the cloud."""
+MOST_VOXELS = 100_000_000
+"""A voxel takes 20 bytes."""
+WIDEST_RAD = float(np.radians(45.0))
 
 
 @dataclass(frozen=True)
@@ -26,7 +31,16 @@ class VolumeSettings:
 
     method: Method = "auto"
     voxel_mm: float = 2.5
-    half_angle_rad: float = float(np.radians(45.0))
+    half_angle_rad: float | None = None
+    """None: as wide as the pitch allows, at most `WIDEST_RAD`."""
+
+
+def clean_half_angle_rad(pitch_mm: float, wavelength_mm: float) -> float:
+    """Half angle up to which a pitch takes two samples of every wave that comes back: beyond it, surfaces echo twice.
+
+    Between two poses the path to a voxel at this angle changes by a wave: sin = wavelength / (2 pitch).
+    """
+    return min(WIDEST_RAD, float(np.arcsin(min(1.0, wavelength_mm / (2 * pitch_mm)))))
 
 
 def make_volume(scan: SoundScan, images: Images, settings: VolumeSettings, progress: Progress = silent) -> Volume:
@@ -36,28 +50,42 @@ def make_volume(scan: SoundScan, images: Images, settings: VolumeSettings, progr
     ------
     IrregularScanError
         If convolution was asked for and the poses follow no regular raster.
+    ConfigError
+        If the voxels are too many.
     """
     poses = [scan.pipeline.rig_from_array(ping.robot_pose) for ping in scan.pings]
-    emitter = np.array(scan.pipeline.calibration.emitter_mm, dtype=np.float64)
+    found = scan.pipeline.calibration
+    emitter = np.array(found.emitter_mm, dtype=np.float64)
     emitters = np.array([apply(pose, emitter[None])[0] for pose in poses])
     axes = np.array([pose[:3, 2] for pose in poses])
     z = images.points["z_mm"]
     z_mm = float(z.min()) - BELOW_MM, float(z.max()) + ABOVE_MM
     grid, notes = _grid(emitters, axes, z_mm, settings)
+    if np.prod(grid.shape) > MOST_VOXELS:
+        raise ConfigError(
+            f"--voxel {settings.voxel_mm:g}: {grid.shape[2]} x {grid.shape[1]} x {grid.shape[0]} voxels would take "
+            f"{20e-9 * np.prod(grid.shape):.0f} GB; take larger ones"
+        )
+    half_angle_rad = settings.half_angle_rad
+    if half_angle_rad is None:
+        wavelength_mm = 1e3 * found.speed_of_sound_mps / (0.5 * (found.low_hz + found.high_hz))
+        half_angle_rad = clean_half_angle_rad(spacing_mm(emitters), wavelength_mm)
+        notes = (*notes, f"half angle {np.degrees(half_angle_rad):.0f} deg, what the pitch allows")
     heights = apply(invert(grid.rig_from_grid), emitters)[:, 2]
+    spread_mm = float(np.linalg.norm(np.array(found.receivers_mm) - emitter, axis=1).max())
     shortest = max(2 * float(heights.min() - grid.z_mm[-1]), MIN_PATH_MM)
-    longest = 2 * float(heights.max() - grid.z_mm[0]) / np.cos(settings.half_angle_rad)
-    if shortest >= longest:
+    longest = 2 * float(heights.max() - grid.z_mm[0]) / np.cos(half_angle_rad) + spread_mm
+    if heights.min() <= grid.z_mm[-1] or shortest >= longest:
         raise ValueError(
             f"the array scanned at {heights.min():.0f} mm, inside the volume up to {grid.z_mm[-1]:.0f} mm; scan higher"
         )
     longest = min(longest, _record_mm(scan))
     progress("gating", 0, len(scan.pings))
     echoes = gate_pings(scan.pings, scan.pipeline, (shortest, longest))
-    found = delay_and_sum(
-        echoes, grid, settings.method, half_angle_rad=settings.half_angle_rad, coherence=True, progress=progress
+    volume = delay_and_sum(
+        echoes, grid, settings.method, half_angle_rad=half_angle_rad, coherence=True, progress=progress
     )
-    return Volume(found.grid, found.values, found.coherence, found.method, (*notes, *found.notes))
+    return Volume(volume.grid, volume.values, volume.coherence, volume.method, (*notes, *volume.notes))
 
 
 def _grid(

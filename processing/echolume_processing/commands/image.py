@@ -64,9 +64,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--half-angle",
         type=acute,
-        default=45.0,
         metavar="DEG",
-        help="poses that see a voxel further off their axis are left out of it (default: 45)",
+        help="poses that see a voxel further off their axis are left out of it (default: what the pitch allows, to 45)",
     )
     parser.add_argument("--json", action="store_true", help="print the results as JSON")
 
@@ -78,7 +77,8 @@ def run(args: argparse.Namespace) -> int:
     from echolume_processing.sound_volume import VolumeSettings
 
     maps = MapSettings(args.pixel, args.levels, args.interpolate)
-    volume = VolumeSettings(args.method or "auto", args.voxel, math.radians(args.half_angle)) if args.volume else None
+    half_angle_rad = None if args.half_angle is None else math.radians(args.half_angle)
+    volume = VolumeSettings(args.method or "auto", args.voxel, half_angle_rad) if args.volume else None
     progress = ProgressLine()
     try:
         found = image_archive(args.archive, args.out, maps, volume, progress)

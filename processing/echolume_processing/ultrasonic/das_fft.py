@@ -92,7 +92,8 @@ class _Convolution:
         order = np.argsort(cells, kind="stable")
         places, starts, self._pings = np.unique(cells[order], return_index=True, return_counts=True)
         self._rows, self._columns = places // CELLS, places % CELLS
-        self._signals = np.add.reduceat(signals[order], starts, axis=0)
+        # (receivers, samples, places)
+        self._signals = np.ascontiguousarray(np.add.reduceat(signals[order], starts, axis=0).transpose(1, 2, 0))
         self._echoes = echoes
         self._placed = placed
         self._grid = grid
@@ -101,7 +102,6 @@ class _Convolution:
             signals, width * echoes.step_mm, wavenumber * echoes.step_mm, wavenumber * echoes.first_mm, lost
         )
         self._away = _differences(placed, grid)
-        self._kernel = np.empty((0, *self._away.shape), dtype=np.complex64)
 
     def slice(self, number: int) -> NDArray[np.complex64]:
         """Sum over all poses and receivers at slice `number`, (ny, nx)."""
@@ -111,25 +111,25 @@ class _Convolution:
         total = np.zeros(shape, dtype=np.complex64)
         if not len(analysis):
             return self._interleaved(total)
-        if len(analysis) > len(self._kernel):
-            self._kernel = np.empty((len(analysis), *shape), dtype=np.complex64)
-        kernel = self._kernel[: len(analysis)]
-        coefficients = np.empty((len(analysis), length_y, length_x), dtype=np.complex64)
+        kernel, coefficients = np.empty((2, len(analysis), length_y, length_x), dtype=np.complex64)
+        places = np.zeros((len(analysis), length_y * length_x), dtype=np.complex64)
+        words, floats = kernel.view(np.float64), table.view(np.float32)
         per_mm = self._basis.fine / self._echoes.step_mm
         start = (self._echoes.first_mm + first * self._echoes.step_mm) * per_mm
+        window = slice(first, first + analysis.shape[1])
         for channel, offset in enumerate(self._placed.offsets_mm):
-            coefficients[:] = 0
-            found = self._signals[:, channel, first : first + analysis.shape[1]] @ analysis.T
-            coefficients[:, self._rows, self._columns] = found.T
-            lay_kernel(
-                kernel, table, self._away.x_mm, self._away.y_mm, np.float32(drop), offset.astype(np.float32),
-                np.float32(per_mm), np.float32(start), self._placed.axis.astype(np.float32),
-                np.float32(self._min_cosine),
-            )  # fmt: skip
-            _transform(coefficients)
-            _transform(kernel.reshape(-1, length_y, length_x))
-            multiply_add(total, kernel, coefficients)
-        _transform(total.reshape(phases_y * phases_x, length_y, length_x), cv2.DFT_INVERSE | cv2.DFT_SCALE)
+            places[:, self._rows * length_x + self._columns] = analysis @ self._signals[channel, window]
+            _transform(places.reshape(coefficients.shape), coefficients)
+            for py, px in np.ndindex(phases_y, phases_x):
+                lay_kernel(
+                    words, floats, self._away.x_mm[px], self._away.y_mm[py], np.float32(drop),
+                    offset.astype(np.float32), np.float32(per_mm), np.float32(start),
+                    self._placed.axis.astype(np.float32), np.float32(self._min_cosine),
+                )  # fmt: skip
+                _transform(kernel, kernel)
+                multiply_add(total[py, px], kernel, coefficients)
+        planes = total.reshape(phases_y * phases_x, length_y, length_x)
+        _transform(planes, planes, cv2.DFT_INVERSE | cv2.DFT_SCALE)
         return self._interleaved(total)
 
     def seen(self, number: int) -> NDArray[np.float32]:
@@ -142,10 +142,11 @@ class _Convolution:
         kernel = np.ascontiguousarray(within, dtype=np.complex64)
         poses = np.zeros((1, *kernel.shape[2:]), dtype=np.complex64)
         poses[0, self._rows, self._columns] = self._pings
-        _transform(poses)
-        _transform(kernel.reshape(-1, *kernel.shape[2:]))
+        planes = kernel.reshape(-1, *kernel.shape[2:])
+        _transform(poses, poses)
+        _transform(planes, planes)
         kernel *= poses[0]
-        _transform(kernel.reshape(-1, *kernel.shape[2:]), cv2.DFT_INVERSE | cv2.DFT_SCALE)
+        _transform(planes, planes, cv2.DFT_INVERSE | cv2.DFT_SCALE)
         return np.rint(self._interleaved(kernel).real)
 
     def _samples(self, drop_mm: float) -> tuple[float, float]:
@@ -196,8 +197,11 @@ def fast_length(at_least: int) -> int:
     return length
 
 
-def _transform(planes: NDArray[np.complex64], flags: int = 0) -> None:
-    """Fourier transform of each plane (n, ly, lx) in place."""
-    pairs = planes.view(np.float32).reshape(*planes.shape, 2)
-    for plane in pairs:
-        cv2.dft(plane, plane, flags=flags | cv2.DFT_COMPLEX_OUTPUT)
+def _transform(planes: NDArray[np.complex64], into: NDArray[np.complex64], flags: int = 0) -> None:
+    """Fourier transform of each plane (n, ly, lx), which may be written over."""
+    for plane, spectrum in zip(_pairs(planes), _pairs(into), strict=True):
+        cv2.dft(plane, spectrum, flags=flags | cv2.DFT_COMPLEX_OUTPUT)
+
+
+def _pairs(planes: NDArray[np.complex64]) -> NDArray[np.float32]:
+    return planes.view(np.float32).reshape(*planes.shape, 2)

@@ -17,8 +17,8 @@ from echolume_processing.ultrasonic.voxels import Volume, VoxelGrid
 Method = Literal["fft", "gather", "auto"]
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is."""
-LOST = 1e-6
-"""Share of an echo's energy that convolution may leave out (a thousandth of its amplitude)."""
+LOST = 1e-4
+"""Share of an echo's energy that convolution may leave out (in sum a few thousandths of the amplitude)."""
 
 
 def silent(what: str, done: int, total: int) -> None:

@@ -8,6 +8,9 @@ from scipy import linalg
 
 from echolume_messages.geometry import require_shape
 
+NOISE = 5.0
+"""Percentile of the band's power that counts as noise."""
+
 
 class EchoBasis:
     """Karhunen-Loeve functions of echoes with the mean power spectrum of some signals.
@@ -44,7 +47,10 @@ class EchoBasis:
         power = np.zeros(2 * self._samples)
         for pose in signals:
             power += np.sum(np.abs(np.fft.fft(pose, 2 * self._samples, axis=1)) ** 2, axis=0)
-        power[np.abs(np.fft.fftfreq(len(power))) > 0.5 * width + 0.5 / self._samples] = 0
+        outside = np.abs(np.fft.fftfreq(len(power))) > 0.5 * width + 0.5 / self._samples
+        # White noise has no place in the spectrum of an echo: it would ask for a function per sample.
+        power = np.maximum(power - np.percentile(power[~outside], NOISE), 0)
+        power[outside] = 0
         self._lags = self._covariance(power / max(float(power.sum()), np.finfo(np.float64).tiny))
 
     def over(self, first: float, last: float) -> tuple[NDArray[np.complex64], NDArray[np.complex64], int]:

@@ -17,7 +17,8 @@ import pymust
 from scipy import signal
 
 from echolume_processing.ultrasonic.acoustics import directivity
-from echolume_processing.ultrasonic.das_gather import lay_poses, sharpened, turn_weights
+from echolume_processing.ultrasonic.das_gather import sharpened, turn_weights
+from echolume_processing.ultrasonic.das_kernels import lay_poses
 from echolume_processing.ultrasonic.delay_and_sum import delay_and_sum
 from echolume_processing.ultrasonic.gated import Band, GatedEchoes
 from echolume_processing.ultrasonic.voxels import VoxelGrid
@@ -46,7 +47,7 @@ LOOP = r"""
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
-/* The gather of das_gather.py, written again. SPLIT: reading the samples is a loop of its own. */
+/* The gather of das_kernels.py, written again. SPLIT: reading the samples is a loop of its own. */
 void gather(float *out, const float *iq, const double *em, const double *rc, const double *x, const double *y,
             const float *z, int poses, int channels, int samples, int nx, int ny, int nz, float per_mm, float first,
             float turns, const float *weights) {

@@ -64,7 +64,7 @@ def terms(emitters: np.ndarray, where: VoxelGrid, targets: np.ndarray = TARGETS_
     return out
 
 
-@pytest.mark.parametrize(("method", "error"), [("fft", 3e-3), ("gather", 1e-3)])
+@pytest.mark.parametrize(("method", "error"), [("fft", 6e-3), ("gather", 1e-3)])
 def test_a_volume_is_the_mean_of_all_echoes_at_their_voxels(method, error):
     emitters, where = raster(), grid()
     found = delay_and_sum(echoes_of(emitters), where, method)
@@ -120,7 +120,7 @@ def test_lost_and_repeated_pings_do_not_break_the_lattice():
     emitters = np.delete(raster(), [3, 20, 21], axis=0)
     emitters = np.concatenate([emitters, emitters[10:12]])[np.random.default_rng(0).permutation(len(emitters) + 2)]
     ways = [delay_and_sum(echoes_of(emitters), grid(), m).values for m in ("fft", "gather")]
-    assert np.linalg.norm(ways[0] - ways[1]) < 3e-3 * np.linalg.norm(ways[1])
+    assert np.linalg.norm(ways[0] - ways[1]) < 6e-3 * np.linalg.norm(ways[1])
 
 
 def test_poses_off_the_raster_are_refused_by_convolution_and_gathered_with_a_note():

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from echolume_processing.ultrasonic.das_gather import Tell
-from echolume_processing.ultrasonic.das_kernel import lay_kernel, multiply_add
+from echolume_processing.ultrasonic.das_gather import Tell, least_cosine
+from echolume_processing.ultrasonic.das_kernels import lay_kernel, multiply_add
 from echolume_processing.ultrasonic.echo_basis import EchoBasis
 from echolume_processing.ultrasonic.gated import GatedEchoes
 from echolume_processing.ultrasonic.scan_lattice import Placement, place
@@ -42,23 +42,23 @@ class _Differences:
 
 
 def convolve(
-    echoes: GatedEchoes, grid: VoxelGrid, min_cosine: float, coherence: bool, tell: Tell, lost: float
+    echoes: GatedEchoes, grid: VoxelGrid, half_angle_rad: float, coherence: bool, tell: Tell
 ) -> tuple[NDArray[np.complex64], NDArray[np.float32], NDArray[np.float32]]:
     """Sum of the echoes at each voxel, sum of their squares (empty if not asked for), and how many there were.
 
-    All three are (nz, ny, nx). `lost` is the share of an echo's energy that the basis may leave out.
+    All three are (nz, ny, nx).
 
     Raises
     ------
     IrregularScanError
         If the poses do not lie on a lattice of the grid.
     """
-    placed = place(echoes, grid)
-    waves = _Convolution(echoes.iq, echoes, echoes.bandwidth, echoes.wavenumber, placed, grid, min_cosine, lost)
+    placed, min_cosine = place(echoes, grid), least_cosine(half_angle_rad)
+    waves = _Convolution(echoes.iq, echoes, echoes.bandwidth, echoes.wavenumber, placed, grid, min_cosine)
     strength = None
     if coherence:
         square = (echoes.iq.real**2 + echoes.iq.imag**2).astype(np.complex64)
-        strength = _Convolution(square, echoes, 2 * echoes.bandwidth, 0.0, placed, grid, min_cosine, lost)
+        strength = _Convolution(square, echoes, 2 * echoes.bandwidth, 0.0, placed, grid, min_cosine)
     nz, ny, nx = grid.shape
     values = np.empty(grid.shape, dtype=np.complex64)
     power = np.zeros((nz if coherence else 0, ny, nx), dtype=np.float32)
@@ -85,7 +85,6 @@ class _Convolution:
         placed: Placement,
         grid: VoxelGrid,
         min_cosine: float,
-        lost: float,
     ) -> None:
         # Places pinged twice add up before everything else.
         cells = placed.index[:, 1] * CELLS + placed.index[:, 0]
@@ -98,15 +97,14 @@ class _Convolution:
         self._placed = placed
         self._grid = grid
         self._min_cosine = min_cosine
-        self._basis = EchoBasis(
-            signals, width * echoes.step_mm, wavenumber * echoes.step_mm, wavenumber * echoes.first_mm, lost
-        )
+        width_rad = 2 * np.pi * width * echoes.step_mm
+        self._basis = EchoBasis(signals, echoes.first_mm, echoes.step_mm, width_rad, wavenumber)
         self._away = _differences(placed, grid)
 
     def slice(self, number: int) -> NDArray[np.complex64]:
         """Sum over all poses and receivers at slice `number`, (ny, nx)."""
         drop = self._grid.z_mm[number] - self._placed.first_mm[2]
-        analysis, table, first = self._basis.over(*self._samples(drop))
+        analysis, table, first = self._basis.over(*self._paths_mm(drop))
         phases_y, phases_x, length_y, length_x = shape = self._away.shape
         total = np.zeros(shape, dtype=np.complex64)
         if not len(analysis):
@@ -149,19 +147,18 @@ class _Convolution:
         _transform(planes, planes, cv2.DFT_INVERSE | cv2.DFT_SCALE)
         return np.rint(self._interleaved(kernel).real)
 
-    def _samples(self, drop_mm: float) -> tuple[float, float]:
-        """Samples between which the paths at this height lie."""
+    def _paths_mm(self, drop_mm: float) -> tuple[float, float]:
+        """Paths between which all those at this height lie."""
         ends = [np.array([np.abs(v).min(), np.abs(v).max()]) for v in (self._away.x_mm, self._away.y_mm)]
-        reach = np.hypot(ends[0], ends[1])
-        spread = float(np.linalg.norm(self._placed.offsets_mm, axis=1).max())
-        near, far = 2 * np.hypot(reach[0], drop_mm) - spread, 2 * np.hypot(reach[1], drop_mm) + spread
-        if self._min_cosine > 0:
-            lean = float(np.hypot(*self._placed.axis[:2]))
-            cosine = self._min_cosine * np.sqrt(1 - lean**2) - lean * np.sqrt(1 - self._min_cosine**2)
-            if cosine > 0:
-                far = min(far, 2 * abs(drop_mm) / cosine + spread)
-        first, step = self._echoes.first_mm, self._echoes.step_mm
-        return (near - first) / step, (far - first) / step
+        near, far = (float(r) for r in np.hypot(ends[0], ends[1]))
+        aside = float(np.linalg.norm(self._placed.offsets_mm[:, :2], axis=1).max())
+        up = float(np.abs(self._placed.offsets_mm[:, 2]).max())
+        lean = float(np.hypot(*self._placed.axis[:2]))
+        if self._min_cosine > lean:
+            limit_rad = float(np.arccos(self._min_cosine) + np.arcsin(lean))
+            far = min(far, abs(drop_mm) * float(np.tan(limit_rad)))
+        shortest = np.hypot(near, drop_mm) + np.hypot(max(near - aside, 0.0), drop_mm) - up
+        return shortest, np.hypot(far, drop_mm) + np.hypot(far + aside, drop_mm) + up
 
     def _interleaved(self, phases: NDArray[np.complex64]) -> NDArray[np.complex64]:
         """The slice (ny, nx) from its phases (py, px, ly, lx)."""

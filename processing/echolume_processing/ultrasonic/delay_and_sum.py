@@ -17,8 +17,6 @@ from echolume_processing.ultrasonic.voxels import Volume, VoxelGrid
 Method = Literal["fft", "gather", "auto"]
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is."""
-LOST = 1e-4
-"""Share of an echo's energy that convolution may leave out (in sum a few thousandths of the amplitude)."""
 
 
 def silent(what: str, done: int, total: int) -> None:
@@ -33,7 +31,6 @@ def delay_and_sum(
     half_angle_rad: float | None = None,
     coherence: bool = False,
     progress: Progress = silent,
-    lost: float = LOST,
 ) -> Volume:
     """Sum all echoes at the path emitter -> voxel -> receiver, with the carrier's phase there.
 
@@ -50,8 +47,6 @@ def delay_and_sum(
         Poses that see a voxel further off the array's axis are left out.
     coherence : bool
         Also find the coherence factor abs(sum)^2 / (n sum of abs^2), over the same poses. Costs about as much again.
-    lost : float
-        Share of an echo's energy that ``fft`` may leave out.
 
     Returns
     -------
@@ -70,7 +65,7 @@ def delay_and_sum(
     """
     if half_angle_rad is not None and not 0 < half_angle_rad <= np.pi / 2:
         raise ValueError(f"half_angle_rad: expected above 0 and at most pi/2, got {half_angle_rad}")
-    min_cosine = -2.0 if half_angle_rad is None else float(np.cos(half_angle_rad))
+    limit_rad = np.pi if half_angle_rad is None else half_angle_rad
 
     def tell(done: int, total: int) -> None:
         progress("delay-and-sum", done, total)
@@ -78,13 +73,13 @@ def delay_and_sum(
     notes: tuple[str, ...] = ()
     if method != "gather":
         try:
-            found = convolve(echoes, grid, min_cosine, coherence, tell, lost)
+            found = convolve(echoes, grid, limit_rad, coherence, tell)
             return _volume(grid, *found, coherence, "fft", notes)
         except IrregularScanError as error:
             if method == "fft":
                 raise
             notes = (f"gathered, because {error}",)
-    return _volume(grid, *gather(echoes, grid, min_cosine, coherence, tell), coherence, "gather", notes)
+    return _volume(grid, *gather(echoes, grid, limit_rad, coherence, tell), coherence, "gather", notes)
 
 
 def _volume(

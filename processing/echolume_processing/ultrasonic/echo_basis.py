@@ -8,6 +8,8 @@ from scipy import linalg
 
 from echolume_messages.geometry import require_shape
 
+LOST = 3e-4
+"""Share of an echo's energy that the functions may leave out: a few thousandths of the amplitude of a sum."""
 NOISE = 5.0
 """Percentile of the band's power that counts as noise."""
 
@@ -19,14 +21,12 @@ class EchoBasis:
     ----------
     signals : (poses, receivers, samples) complex64
         Baseband; only its power spectrum matters, not where or how strong the echoes are.
-    width : float
-        Full width of their band, waves per sample; what lies outside is no echo.
-    turn_rad : float
-        Carrier's phase from sample to sample.
-    phase_rad : float
-        Carrier's phase at sample 0.
-    lost : float
-        Share of an echo's energy that may be left out.
+    first_mm, step_mm : float
+        Path of sample 0, and from sample to sample.
+    width_rad : float
+        Full width of their band, rad from sample to sample; what lies outside is no echo.
+    wavenumber : float
+        Of the carrier, rad/mm.
 
     Notes
     -----
@@ -35,26 +35,26 @@ class EchoBasis:
     """
 
     def __init__(
-        self, signals: NDArray[np.complex64], width: float, turn_rad: float, phase_rad: float, lost: float
+        self, signals: NDArray[np.complex64], first_mm: float, step_mm: float, width_rad: float, wavenumber: float
     ) -> None:
         require_shape("signals", signals, (None, None, None))
         self._samples = signals.shape[2]
-        self._lost = lost
-        self._turn_rad = turn_rad
-        self._phase_rad = phase_rad
-        self.fine = max(16, int(np.ceil(10 * abs(turn_rad))))
+        self._first_mm = first_mm
+        self._step_mm = step_mm
+        self._wavenumber = wavenumber
+        self.fine = max(16, int(np.ceil(10 * wavenumber * step_mm)))
         """Entries of a table per sample: the carrier turns by a tenth of a radian between two."""
         power = np.zeros(2 * self._samples)
         for pose in signals:
             power += np.sum(np.abs(np.fft.fft(pose, 2 * self._samples, axis=1)) ** 2, axis=0)
-        outside = np.abs(np.fft.fftfreq(len(power))) > 0.5 * width + 0.5 / self._samples
+        outside = np.abs(np.fft.fftfreq(len(power))) > width_rad / (4 * np.pi) + 0.5 / self._samples
         # White noise has no place in the spectrum of an echo: it would ask for a function per sample.
         power = np.maximum(power - np.percentile(power[~outside], NOISE), 0)
         power[outside] = 0
         self._lags = self._covariance(power / max(float(power.sum()), np.finfo(np.float64).tiny))
 
-    def over(self, first: float, last: float) -> tuple[NDArray[np.complex64], NDArray[np.complex64], int]:
-        """Functions for the samples from `first` to `last`.
+    def over(self, shortest_mm: float, longest_mm: float) -> tuple[NDArray[np.complex64], NDArray[np.complex64], int]:
+        """Functions for a range of paths.
 
         Returns
         -------
@@ -65,7 +65,9 @@ class EchoBasis:
         start : int
             No functions at all if the range lies outside the signals, or these are all silent.
         """
-        start, end = max(0, int(np.floor(first)) - 1), min(self._samples - 1, int(np.ceil(last)) + 1)
+        first, last = ((path - self._first_mm) / self._step_mm for path in (shortest_mm, longest_mm))
+        # The table's outermost entries are no paths, so the first one lies before the range.
+        start, end = max(0, int(np.floor(first - 1 / self.fine))), min(self._samples - 1, int(np.ceil(last)))
         count = end - start + 1
         if count < 2 or not self._lags[0].real > 0:
             return np.zeros((0, 1), np.complex64), np.zeros((0, 0), np.complex64), 0
@@ -73,15 +75,15 @@ class EchoBasis:
         strength, vectors = linalg.eigh(linalg.toeplitz(column, column.conj()))
         strength, vectors = strength[::-1], vectors[:, ::-1]
         left = 1 - np.cumsum(strength) / strength.sum()
-        kept = int(np.argmax(left <= self._lost)) + 1 if left.min() <= self._lost else count
+        kept = int(np.argmax(left <= LOST)) + 1 if left.min() <= LOST else count
         entries = (count - 1) * self.fine + 1
         middle = len(self._lags) - 1
         sides = np.concatenate([self._lags[:0:-1].conj(), self._lags])
         lags = np.stack([sides[middle - k : middle - k + entries] for k in range(0, count * self.fine, self.fine)])
         table = np.zeros((entries + 2, kept), dtype=np.complex128)
         table[:entries] = lags.T @ (vectors[:, :kept] / strength[:kept])
-        phase = self._phase_rad + self._turn_rad * (start + np.arange(entries) / self.fine)
-        table[:entries] *= np.exp(1j * phase)[:, None]
+        path_mm = self._first_mm + self._step_mm * (start + np.arange(entries) / self.fine)
+        table[:entries] *= np.exp(1j * self._wavenumber * path_mm)[:, None]
         table[0] = 0
         return vectors[:, :kept].conj().T.astype(np.complex64), table.astype(np.complex64), start
 

@@ -417,6 +417,6 @@ def imaging_rows() -> dict[str, float]:
     figures |= peak_rows() | lateral_rows()
     print(f"\n{'images':28}{'measured':>10}{'asked':>10}{'aim':>8}")
     for key, (bar, aim) in TARGETS.items():
-        measured = f"{figures[key]:10.4g}" if key in figures else "  no cc"
+        measured = f"{figures[key]:10.6g}" if key in figures else "  no cc"
         print(f"{key:28}{measured}{bar:10g}{aim:8g}")
     return figures

@@ -61,7 +61,7 @@ def message(topic: topics.Topic, array: np.ndarray, trigger: int, source: Source
 def write(path: Path, calibration: Calibration | None, pings: list[Message]) -> Path:
     start = {"scan": "s", "plan": msgspec.to_builtins(PLAN), "calibration": msgspec.to_builtins(calibration)}
     writer = ArchiveWriter(path)
-    for record in (message(topics.SCAN_START, json_array(start), -1, Source()), *pings):
+    for record in (message(topics.SCAN_START, json_array(start), 0, Source()), *pings):
         writer.write(record)
     writer.close()
     return path

@@ -15,13 +15,13 @@ from echolume_messages.plan import Pose6
 from echolume_messages.rig import ArraySettings
 from echolume_messages.types import EchoKind
 from echolume_processing.ping import Ping
-from echolume_processing.ultrasonic.acoustics import GaussianFit
 from echolume_processing.ultrasonic.calibrate import calibrate_plate
 from echolume_processing.ultrasonic.contact import contact, fit_plane, fit_point
 from echolume_processing.ultrasonic.contacts import Contacts, contacts, full
 from echolume_processing.ultrasonic.cycles import resolve_cycles
 from echolume_processing.ultrasonic.layout import layout_of
 from echolume_processing.ultrasonic.pipeline import UltrasonicPipeline, waveforms_from_counts
+from echolume_processing.ultrasonic.plate_energy import GaussianFit
 from echolume_processing.ultrasonic.poses import plate_poses
 from echolume_processing.ultrasonic.witness import EnergyCurve, energy_curve, energy_witness
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echolume_messages.geometry import require_shape
-from echolume_processing.ultrasonic.acoustics import GaussianFit, angle_from_energy, fit_gaussian
+from echolume_processing.ultrasonic.plate_energy import GaussianFit, angle_from_energy, fit_gaussian
 
 AGREE_SIGMAS = 3.0
 AXIS = np.array([0.0, 0.0, 1.0])

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from echolume_messages.rig import ArrayElementLayout
 from echolume_messages.types import EchoKind
-from echolume_processing.ultrasonic import contact, envelope, flight, lobes
+from echolume_processing.ultrasonic import contact, envelope, flight, lobes, matched_filter
 
 RATE_HZ = 250e3
 RECEIVERS = np.array(ArrayElementLayout().receivers_mm)
@@ -21,16 +21,16 @@ def pulse(arrival: float, samples: int = 1024) -> np.ndarray:
     return np.fft.irfft(band * np.exp(-2j * np.pi * f * arrival / RATE_HZ), samples)
 
 
-def filter_bank(samples: int = 1024) -> envelope.MatchedFilter:
+def filter_bank(samples: int = 1024) -> matched_filter.MatchedFilter:
     template = np.tile(pulse(ORIGIN, 200), (1, 1)).astype(np.float32)
-    return envelope.matched_filter(template, ORIGIN, RATE_HZ, (30e3, 60e3), samples)
+    return matched_filter.matched_filter(template, ORIGIN, RATE_HZ, (30e3, 60e3), samples)
 
 
 def arrivals(waveform: np.ndarray, **keywords: bool) -> flight.Arrivals:
     bank = filter_bank()
-    compressed = bank.compress(waveform[None].astype(np.float32))
-    threshold = np.full(compressed.shape[1], 0.45, dtype=np.float32)
-    return flight.first_arrivals(compressed, bank, 4 * RATE_HZ, (400, 4000), threshold, **keywords)
+    echoes = bank.baseband(waveform[None].astype(np.float32))
+    threshold = np.full(echoes.magnitude.shape[1], 0.45, dtype=np.float32)
+    return flight.first_arrivals(echoes, (100 / RATE_HZ, 1000 / RATE_HZ), threshold, **keywords)
 
 
 def test_the_paper_envelope_of_a_tone_is_its_amplitude_without_delay():

@@ -12,6 +12,10 @@ from numpy.typing import NDArray
 Values = NDArray[np.float64]
 Spectra = NDArray[np.complex64]
 
+ENOUGH = 512
+"""Samples that tell the noise to 3 %."""
+NEAR = 0.02
+"""Of the step between samples: the peak is then reached by one more step."""
 RUN = 32
 """Bins whose phases come from one table."""
 
@@ -42,9 +46,7 @@ def fill(spectrum: Spectra, first: int, weights: Spectra, products: Spectra, pad
 
 
 @njit(cache=True, nogil=True)
-def band_of(
-    spectrum: Spectra, first: int, taper: NDArray[np.float32], scale: float, padded: Spectra
-) -> None:
+def band_of(spectrum: Spectra, first: int, taper: NDArray[np.float32], scale: float, padded: Spectra) -> None:
     """Bins of the band times one taper for all channels, followed by zeros."""
     bins = len(taper)
     for r in range(padded.shape[0]):
@@ -161,7 +163,10 @@ def search(
         row = magnitude[r]
         best, best_at, reached, lobes = 0.0, -1, -1, 0
         for k in range(first, last):
-            left, middle = row[k - 1] * inverse_threshold[k - 1], row[k] * inverse_threshold[k]
+            middle = row[k] * inverse_threshold[k]
+            if middle < 0.8 * floor:  # noise, mostly; a maximum between two samples is not that much higher
+                continue
+            left = row[k - 1] * inverse_threshold[k - 1]
             right = row[k + 1] * inverse_threshold[k + 1]
             if middle <= left or middle < right:
                 continue
@@ -199,9 +204,10 @@ def peak_of(row: Spectra, centre: float, start: float, reach: float, work: Value
         if abs(angle + change - start) > 2 * reach:
             break
         angle += change
-        if abs(change) < 1e-4 * reach:
+        if abs(change) < NEAR * reach:
+            for k in range(4):
+                work[k] += change * (work[k + 2] + (0.5 * change * work[k + 4] if k < 2 else 0.0))
             break
-    moments(row, centre, angle, work)
     return angle
 
 
@@ -230,7 +236,7 @@ def refine(
             drift = (work[0] * work[3] - work[1] * work[2]) / square if square > 0 else 0.0
             drift = min(max(drift, -0.1 * centre[r]), 0.1 * centre[r])
             angle -= wrapped / (centre[r] + drift)
-            if abs(wrapped) < 1e-5:
+            if abs(wrapped) < 1e-3 or turn == 2:
                 break
             moments(row, centre[r] - first_bin, angle, work)
         out[r, 0], out[r, 1], out[r, 2], out[r, 3] = peak, angle, amplitude, phase
@@ -251,6 +257,8 @@ def without_echo(
     the first sample.
     """
     work = np.empty(6)
+    table = np.empty(RUN, dtype=np.complex64)
+    one = complex(1.0, 0.0)
     bins = products.shape[1]
     for r in range(products.shape[0]):
         for k in range(bins):
@@ -262,9 +270,18 @@ def without_echo(
         begin = first_bin * angle[r]
         turned = complex(work[0], work[1]) * complex(math.cos(begin), -math.sin(begin))
         step = complex(math.cos(angle[r]), -math.sin(angle[r]))
-        for k in range(bins):
-            padded[r, k] -= templates[r, k] * np.complex64(turned)
-            turned *= step
+        for start in range(0, bins, RUN):
+            if start == 0:
+                table[0] = 1.0
+                one = complex(1.0, 0.0)
+                for k in range(1, RUN):
+                    one *= step
+                    table[k] = one
+                one *= step
+            height = np.complex64(turned)
+            for k in range(min(RUN, bins - start)):
+                padded[r, start + k] -= templates[r, start + k] * (table[k] * height)
+            turned *= one
 
 
 @njit(cache=True, nogil=True)
@@ -273,14 +290,15 @@ def quietest(magnitude: NDArray[np.float32], first: int, last: int, noise: Value
 
     The mean square of the half of Rayleigh-distributed magnitudes below their median is 2 sigma^2 (1 - ln 2).
     """
-    count = last - first
+    stride = max(1, (last - first) // ENOUGH)
+    count = (last - first) // stride
     scratch = np.empty(max(count, 1), dtype=np.float32)
     for r in range(magnitude.shape[0]):
         noise[r] = 0.0
         if count < 2:
             continue
         for k in range(count):
-            scratch[k] = magnitude[r, first + k]
+            scratch[k] = magnitude[r, first + k * stride]
         select(scratch, count // 2)
         total = 0.0
         for k in range(count // 2):
@@ -308,7 +326,7 @@ def leading_edges(
         if not math.isfinite(start[r]):
             continue
         for _ in range(4):
-            first = int(math.floor(start[r] + shift + 0.5))
+            first = math.floor(start[r] + shift + 0.5)
             if first < 0 or first + lengths[r] > waveforms.shape[1]:
                 break
             a_re = a_im = d_re = d_im = np.float32(0.0)

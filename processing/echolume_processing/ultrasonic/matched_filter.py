@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from echolume_messages.geometry import require_shape
-from echolume_processing.ultrasonic.echo_kernels import band_of, fill, magnitudes, quietest, smoothed_energy, without_echo
+from echolume_processing.ultrasonic.echo_kernels import (
+    band_of,
+    fill,
+    magnitudes,
+    quietest,
+    smoothed_energy,
+    without_echo,
+)
 from echolume_processing.ultrasonic.envelope import Waveforms, band_weights, fast_length, low_pass, paper_delay_s
 
 ComplexEnvelope: TypeAlias = NDArray[np.complex64]
@@ -45,7 +52,7 @@ class MatchedFilter:
     taper: NDArray[np.float32]
     """The band-pass itself, (bins,)."""
     templates: NDArray[np.complex64]
-    """Band-passed analytic spectrum of an echo like the template that arrives at the first sample, (receivers, bins)."""
+    """Band-passed analytic spectrum of a template that arrives at the first sample, (receivers, bins)."""
     pulse: NDArray[np.float64]
     """Spectrum of the compressed pulse, its sum is 1, (receivers, bins)."""
 
@@ -138,6 +145,12 @@ class Baseband:
     def times_s(self) -> NDArray[np.float64]:
         """Of the samples of `magnitude`, after the first sample of the record."""
         return np.arange(self.magnitude.shape[1]) / self.rate_hz
+
+    def magnitude_of(self, products: NDArray[np.complex64]) -> NDArray[np.float32]:
+        """Magnitude (samples at `rate_hz`,) of one channel's compressed echoes from their spectrum (bins,)."""
+        padded = np.zeros((1, _complex_length(PER_BAND * len(products))), dtype=np.complex64)
+        padded[0, : len(products)] = products
+        return magnitude_of(padded)[0, : self.magnitude.shape[1]]
 
     @cached_property
     def passed(self) -> NDArray[np.complex64]:

@@ -13,11 +13,20 @@ from echolume_messages.types import ULTRASONIC_POINT, EchoBlock, Structured
 from echolume_processing.ping import Ping
 from echolume_processing.ultrasonic.air import carried_mps
 from echolume_processing.ultrasonic.contact import contact
+from echolume_processing.ultrasonic.cycles import settle_cycles
 from echolume_processing.ultrasonic.echo_kernels import without_offset
 from echolume_processing.ultrasonic.envelope import Waveforms, energy, paper_envelope
-from echolume_processing.ultrasonic.flight import MAX_PHASE_RAD, Arrivals, first_arrivals
-from echolume_processing.ultrasonic.matched_filter import Baseband, ComplexEnvelope, MatchedFilter, matched_filter, padded_length
+from echolume_processing.ultrasonic.flight import LEAST_NOISE, MAX_PHASE_RAD, Arrivals, first_arrivals
+from echolume_processing.ultrasonic.matched_filter import (
+    PLAIN,
+    Baseband,
+    ComplexEnvelope,
+    MatchedFilter,
+    matched_filter,
+    padded_length,
+)
 from echolume_processing.ultrasonic.onset import leading_edge, onsets
+from echolume_processing.ultrasonic.several import Echoes, several_echoes
 
 MIN_PATH_MM = 110.0
 """Shorter paths drown in the cross-talk and its ringing."""
@@ -27,6 +36,11 @@ SURFACE = 0.45
 little less to keep bars narrower than the Fresnel zone."""
 PATH_FLOOR_MM = 0.05
 """What the model leaves unexplained of a path on a clean plane."""
+ENVELOPE_FLOOR_MM = 0.2
+"""The same of a path by its envelope alone."""
+MAX_CHI_SQUARED = 6.0
+MIN_MARGIN = 9.0
+"""Cycles that all channels agree on: how well they fit a surface, and how much worse the next choice is."""
 UPSAMPLING = 4
 
 
@@ -69,7 +83,7 @@ class UltrasonicPipeline:
         self._receivers_mm = np.array(found.receivers_mm, dtype=np.float64) - self._emitter_mm
         self._surface = surface
         self._gate_mm = gate_mm
-        self._banks: dict[int, MatchedFilter] = {}
+        self._banks: dict[tuple[int, float | None], MatchedFilter] = {}
         whole = energy(paper_envelope(self._templates, found.sample_rate_hz), found.sample_rate_hz)
         self._template_energy = np.maximum(whole, np.finfo(np.float64).tiny)
         centre_hz = self._bank(self._templates.shape[1], found.sample_rate_hz).centre_hz
@@ -109,6 +123,64 @@ class UltrasonicPipeline:
         echoes, cut_s = self._baseband(waveforms, sample_rate_hz, start_s, speed, gate)
         return self._arrivals(waveforms, echoes, cut_s, start_s, speed, gate, strongest)
 
+    def settled(
+        self, found: Arrivals, paths_mm: NDArray[np.float64], speed_mm_per_s: float
+    ) -> tuple[Arrivals, NDArray[np.float64]]:
+        """Arrivals and paths after all channels have settled their cycles together; unchanged where no surface fits."""
+        period_s = 1 / self._bank(self._templates.shape[1], self.calibration.sample_rate_hz).centre_hz
+        envelope_mm = paths_mm + (found.envelope_s - found.time_s) * speed_mm_per_s
+        doubtful = found.doubtful
+        turned_s = np.where(doubtful, -found.phase_rad / (2 * np.pi) * period_s, 0.0)
+        sigma_s = np.hypot(found.envelope_sigma_s, ENVELOPE_FLOOR_MM / speed_mm_per_s)
+        phase_mm = paths_mm + turned_s * speed_mm_per_s
+        agreed = settle_cycles(
+            self._receivers_mm,
+            envelope_mm,
+            sigma_s * speed_mm_per_s,
+            phase_mm,
+            PATH_FLOOR_MM,
+            float(period_s.mean()) * speed_mm_per_s,
+        )
+        if agreed.chi_squared > MAX_CHI_SQUARED or agreed.margin < MIN_MARGIN:
+            return found, paths_mm
+        change_s = (agreed.paths_mm - paths_mm) / speed_mm_per_s
+        relative = np.maximum(found.noise / np.where(found.found, found.amplitude, 1.0), LEAST_NOISE)
+        sigma_s = np.where(found.found, relative * period_s / (2 * np.pi), np.nan)
+        settled = replace(
+            found,
+            time_s=found.time_s + change_s,
+            phase_rad=np.where(doubtful, 0.0, found.phase_rad),
+            sigma_s=np.where(doubtful, sigma_s, found.sigma_s),
+        )
+        return settled, agreed.paths_mm
+
+    def several_echoes(
+        self,
+        waveforms: Waveforms,
+        sample_rate_hz: float,
+        start_s: float,
+        air_temperature_c: float,
+        *,
+        gate_mm: tuple[float, float] | None = None,
+        most: int = 4,
+    ) -> list[tuple[Echoes, NDArray[np.float64]]]:
+        """Echoes of each channel, overlapping ones too, and their path lengths in mm (echoes,).
+
+        Runs the plain matched filter; see `several.several_echoes`.
+        """
+        gate = self._gate_mm if gate_mm is None else gate_mm
+        speed = 1e3 * speed_of_sound_mps(self.calibration, air_temperature_c)
+        echoes, cut_s = self._baseband(waveforms, sample_rate_hz, start_s, speed, gate, whitening=PLAIN)
+        offset_s = cut_s + start_s - float(self._delays_s.mean())
+        gate_s = gate[0] / speed - offset_s, gate[1] / speed - offset_s
+        level = np.ones(echoes.magnitude.shape[1], dtype=np.float32)
+        noise = first_arrivals(echoes, gate_s, level, floor=0.0, strongest=True).noise
+        out: list[tuple[Echoes, NDArray[np.float64]]] = []
+        for found, delay_s in zip(several_echoes(echoes, gate_s, noise, most=most), self._delays_s, strict=True):
+            time_s = found.time_s + cut_s
+            out.append((replace(found, time_s=time_s), (time_s + start_s - delay_s) * speed))
+        return out
+
     def strongest(self, ping: Ping, gate_mm: tuple[float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Arrival after the emission (delay included) and amplitude of the strongest echo in a gate, (receivers,).
 
@@ -146,6 +218,8 @@ class UltrasonicPipeline:
         speed = 1e3 * speed_of_sound_mps(self.calibration, air_temperature_c)
         echoes, cut_s = self._baseband(waveforms, sample_rate_hz, start_s, speed, self._gate_mm)
         found, paths_mm = self._arrivals(waveforms, echoes, cut_s, start_s, speed, self._gate_mm, strongest=False)
+        if found.doubtful.any():
+            found, paths_mm = self.settled(found, paths_mm, speed)
         sigma_mm = np.hypot(PATH_FLOOR_MM, np.nan_to_num(found.sigma_s * speed))
         result = contact(self._receivers_mm, paths_mm, sigma_mm)
         pose = self.rig_from_array(robot_pose)
@@ -174,13 +248,15 @@ class UltrasonicPipeline:
         start_s: float,
         speed: float,
         gate_mm: tuple[float, float],
+        whitening: float | None = None,
     ) -> tuple[Baseband, float]:
         """The part of the record that the gate needs after the matched filter, and when it begins in the record."""
         margin = self._templates.shape[1]
         edges_s = gate_mm[0] / speed - start_s, gate_mm[1] / speed + float(self._delays_s.max()) - start_s
         first = min(max(0, int(edges_s[0] * sample_rate_hz) - margin), waveforms.shape[1])
         last = max(first, min(waveforms.shape[1], int(edges_s[1] * sample_rate_hz) + 2 * margin))
-        return self._bank(last - first, sample_rate_hz).baseband(waveforms[:, first:last]), first / sample_rate_hz
+        bank = self._bank(last - first, sample_rate_hz, whitening)
+        return bank.baseband(waveforms[:, first:last]), first / sample_rate_hz
 
     def _arrivals(
         self,
@@ -208,20 +284,21 @@ class UltrasonicPipeline:
         )
         return moved, (time_s + start_s - self._delays_s) * speed
 
-    def _bank(self, samples: int, sample_rate_hz: float) -> MatchedFilter:
+    def _bank(self, samples: int, sample_rate_hz: float, whitening: float | None = None) -> MatchedFilter:
         found = self.calibration
         if abs(sample_rate_hz - found.sample_rate_hz) > 1e-6 * found.sample_rate_hz:
             raise ValueError(
                 f"the array was calibrated at {found.sample_rate_hz} Hz, these echoes have {sample_rate_hz}"
             )
-        length = padded_length(samples, self._templates.shape[1])
-        if length not in self._banks:
-            self._banks[length] = matched_filter(
+        key = padded_length(samples, self._templates.shape[1]), whitening
+        if key not in self._banks:
+            self._banks[key] = matched_filter(
                 self._templates,
                 found.template_origin,
                 sample_rate_hz,
                 (found.low_hz, found.high_hz),
                 samples,
                 upsampling=UPSAMPLING,
+                whitening=whitening,
             )
-        return self._banks[length]
+        return self._banks[key]

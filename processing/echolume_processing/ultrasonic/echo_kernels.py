@@ -248,10 +248,12 @@ def without_echo(
     passed: Spectra,
     templates: Spectra,
     first_bin: int,
+    begin: int,
+    kept: int,
     angle: Values,
     padded: Spectra,
 ) -> None:
-    """Band-passed spectrum `passed` less the echo at each channel's angle, into the first bins of `padded`.
+    """Band-passed spectrum `passed` less the echo at each channel's angle, `kept` bins from `begin` on.
 
     The echo's complex amplitude is the sum over `products` there; `templates` are the spectra of one that arrives at
     the first sample.
@@ -259,18 +261,17 @@ def without_echo(
     work = np.empty(6)
     table = np.empty(RUN, dtype=np.complex64)
     one = complex(1.0, 0.0)
-    bins = products.shape[1]
     for r in range(products.shape[0]):
-        for k in range(bins):
-            padded[r, k] = passed[r, k]
-        padded[r, bins:] = 0.0
+        for k in range(kept):
+            padded[r, k] = passed[r, begin + k]
+        padded[r, kept:] = 0.0
         if not math.isfinite(angle[r]):
             continue
         moments(products[r], -float(first_bin), angle[r], work)
-        begin = first_bin * angle[r]
-        turned = complex(work[0], work[1]) * complex(math.cos(begin), -math.sin(begin))
+        rest = (first_bin + begin) * angle[r]
+        turned = complex(work[0], work[1]) * complex(math.cos(rest), -math.sin(rest))
         step = complex(math.cos(angle[r]), -math.sin(angle[r]))
-        for start in range(0, bins, RUN):
+        for start in range(0, kept, RUN):
             if start == 0:
                 table[0] = 1.0
                 one = complex(1.0, 0.0)
@@ -279,8 +280,8 @@ def without_echo(
                     table[k] = one
                 one *= step
             height = np.complex64(turned)
-            for k in range(min(RUN, bins - start)):
-                padded[r, start + k] -= templates[r, start + k] * (table[k] * height)
+            for k in range(min(RUN, kept - start)):
+                padded[r, start + k] -= templates[r, begin + start + k] * (table[k] * height)
             turned *= one
 
 

@@ -29,8 +29,10 @@ PLAIN = np.inf
 """Whitening of the plain matched filter, which sits on the Cramer-Rao bound."""
 LEAST_TAPER = 0.02
 """Share of the band-pass below which a template says nothing of the transducer."""
-PER_BAND = 2
+PER_BAND = 1.6
 """Samples of the baseband for each one that its width needs."""
+NOISE_BINS = 256
+"""Bins in the band's middle that tell the noise to 4 %."""
 LENGTH_STEP = 256
 """Records are padded to multiples of this, so that few lengths need a filter of their own."""
 
@@ -118,7 +120,7 @@ class MatchedFilter:
         require_shape("waveforms", waveforms, (len(self.weights), None))
         spectrum = np.asarray(fft.rfft(waveforms, self.length, axis=1))
         receivers, bins = self.weights.shape
-        length = _complex_length(PER_BAND * bins)
+        length = _complex_length(int(PER_BAND * bins))
         products = np.empty((receivers, bins), dtype=np.complex64)
         padded = np.empty((receivers, length), dtype=np.complex64)
         fill(spectrum, self.first_bin, self.weights, products, padded)
@@ -148,7 +150,7 @@ class Baseband:
 
     def magnitude_of(self, products: NDArray[np.complex64]) -> NDArray[np.float32]:
         """Magnitude (samples at `rate_hz`,) of one channel's compressed echoes from their spectrum (bins,)."""
-        padded = np.zeros((1, _complex_length(PER_BAND * len(products))), dtype=np.complex64)
+        padded = np.zeros((1, _complex_length(int(PER_BAND * len(products)))), dtype=np.complex64)
         padded[0, : len(products)] = products
         return magnitude_of(padded)[0, : self.magnitude.shape[1]]
 
@@ -181,14 +183,18 @@ class Baseband:
         """
         bank = self.bank
         receivers, bins = bank.weights.shape
-        padded = np.empty((receivers, _passed_length(bins)), dtype=np.complex64)
+        kept = min(bins, NOISE_BINS)
+        begin = (bins - kept) // 2
+        padded = np.empty((receivers, _passed_length(kept)), dtype=np.complex64)
         angle = time_s * (2 * np.pi * bank.sample_rate_hz / bank.length)
-        without_echo(self.products, self.passed, bank.templates, bank.first_bin, angle, padded)
-        first = max(0, int(np.ceil(gate_s[0] * self.passed_rate_hz)))
-        last = min(padded.shape[1], int(gate_s[1] * self.passed_rate_hz))
+        without_echo(self.products, self.passed, bank.templates, bank.first_bin, begin, kept, angle, padded)
+        rate_hz = bank.sample_rate_hz * padded.shape[1] / bank.length
+        first = max(0, int(np.ceil(gate_s[0] * rate_hz)))
+        last = min(padded.shape[1], int(gate_s[1] * rate_hz))
         out = np.empty(receivers)
         quietest(magnitude_of(padded), first, max(first, last), out)
-        return out * np.sqrt(bank.length / (2 * np.sum(bank.taper.astype(np.float64) ** 2)))
+        passed = bank.taper[begin : begin + kept].astype(np.float64)
+        return out * np.sqrt(bank.length / (2 * np.sum(passed**2)))
 
     def energy(self, first_s: float, last_s: float) -> NDArray[np.float64]:
         """Energy below the paper's envelope of the band-passed record between two times, per channel (receivers,).

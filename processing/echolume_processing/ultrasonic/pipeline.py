@@ -81,6 +81,7 @@ class UltrasonicPipeline:
         self._delays_s = np.array(found.delays_s, dtype=np.float64)
         self._emitter_mm = np.array(found.emitter_mm, dtype=np.float64)
         self._receivers_mm = np.array(found.receivers_mm, dtype=np.float64) - self._emitter_mm
+        self._robot_pose, self._array_pose = found.robot_pose, found.array_pose
         self._surface = surface
         self._gate_mm = gate_mm
         self._banks: dict[tuple[int, float | None], MatchedFilter] = {}
@@ -101,7 +102,7 @@ class UltrasonicPipeline:
 
     def rig_from_array(self, robot_pose: NDArray[np.float64]) -> NDArray[np.float64]:
         """4x4 pose of the array at a robot pose (x, y, z in mm; rx, ry, rz in rad)."""
-        return self.calibration.robot_pose @ robot_from_flange(robot_pose) @ self.calibration.array_pose
+        return self._robot_pose @ robot_from_flange(robot_pose) @ self._array_pose
 
     def compress(self, waveforms: Waveforms, sample_rate_hz: float) -> ComplexEnvelope:
         """Matched-filter output (receivers, UPSAMPLING * samples), 1 at an echo like the reference plate's."""
@@ -220,7 +221,7 @@ class UltrasonicPipeline:
         found, paths_mm = self._arrivals(waveforms, echoes, cut_s, start_s, speed, self._gate_mm, strongest=False)
         if found.doubtful.any():
             found, paths_mm = self.settled(found, paths_mm, speed)
-        sigma_mm = np.hypot(PATH_FLOOR_MM, np.nan_to_num(found.sigma_s * speed))
+        sigma_mm = np.hypot(PATH_FLOOR_MM, np.where(found.found, found.sigma_s * speed, 0.0))
         result = contact(self._receivers_mm, paths_mm, sigma_mm)
         pose = self.rig_from_array(robot_pose)
         used = np.flatnonzero(result.used)

@@ -54,14 +54,16 @@ def onset_parabola(echoes: np.ndarray) -> np.ndarray:
     return out
 
 
-def correlated(echoes: np.ndarray, template: np.ndarray, origin: float) -> np.ndarray:
-    """Highest sample of scipy.signal.correlate with the template, refined by a parabola: no envelope at all."""
+def correlated(echoes: np.ndarray, template: np.ndarray, origin: float, finer: int = 8) -> np.ndarray:
+    """Highest sample of scipy.signal.correlate with the template, both resampled, and a parabola: no envelope at all."""
     out = np.empty(len(echoes))
-    for n, row in enumerate(echoes):
-        score = signal.correlate(row, template, mode="full", method="fft")
+    fine_template = signal.resample(template, finer * len(template))
+    for n, row in enumerate(signal.resample(echoes, finer * echoes.shape[1], axis=1)):
+        score = signal.correlate(row, fine_template, mode="full", method="fft")
         k = int(np.clip(score.argmax(), 1, len(score) - 2))
         bend = score[k - 1] - 2 * score[k] + score[k + 1]
-        out[n] = k + 0.5 * (score[k - 1] - score[k + 1]) / bend - (len(template) - 1) + origin
+        vertex = k + 0.5 * (score[k - 1] - score[k + 1]) / bend
+        out[n] = (vertex - (len(fine_template) - 1)) / finer + origin
     return out
 
 

@@ -33,22 +33,24 @@ def fit(model: int, receivers: Values, paths: Values, sigma: float, at: Values, 
     """Least squares from `at`, in place; chi-squared, infinite if it runs away. `path` receives the model's paths."""
     predict(model, receivers, at, path, slope)
     for _ in range(STEPS):
-        normal, right = np.zeros((3, 3)), np.zeros(3)
+        xx = xy = xz = yy = yz = zz = x = y = z = 0.0
         for i in range(len(paths)):
-            for j in range(3):
-                right[j] += slope[i, j] * (paths[i] - path[i])
-                for k in range(3):
-                    normal[j, k] += slope[i, j] * slope[i, k]
-        for j in range(3):
-            normal[j, j] *= 1 + 1e-9
-        if not np.linalg.det(normal) > 0.0:
+            a, b, c, left = slope[i, 0], slope[i, 1], slope[i, 2], paths[i] - path[i]
+            xx, xy, xz, yy, yz, zz = xx + a * a, xy + a * b, xz + a * c, yy + b * b, yz + b * c, zz + c * c
+            x, y, z = x + a * left, y + b * left, z + c * left
+        # the inverse by its minors
+        ixx, ixy, ixz = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+        iyy, iyz, izz = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
+        whole = xx * ixx + xy * ixy + xz * ixz
+        if not whole > 0.0:
             return math.inf
-        change = np.linalg.solve(normal, right)
-        at += change
+        dx, dy = (ixx * x + ixy * y + ixz * z) / whole, (ixy * x + iyy * y + iyz * z) / whole
+        dz = (ixz * x + iyz * y + izz * z) / whole
+        at[0], at[1], at[2] = at[0] + dx, at[1] + dy, at[2] + dz
         if not at[2] > 0.0:
             return math.inf
         predict(model, receivers, at, path, slope)
-        if abs(change[0]) + abs(change[1]) + abs(change[2]) < 1e-6:
+        if abs(dx) + abs(dy) + abs(dz) < 1e-6:
             break
     total = 0.0
     for i in range(len(paths)):

@@ -6,7 +6,7 @@ two derivatives: angles are times, and all are taken about the bin `centre`, so 
 
 from __future__ import annotations
 
-import math
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -21,6 +21,37 @@ Complex = NDArray[np.complex128]
 ROUNDS = 40
 LIKE = 0.995
 """Correlation of two templates beyond which they are the same echo."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def eliminate(matrix: NDArray[Any], right: NDArray[Any]) -> bool:
+    """Gauss's elimination in place: `right` (n, m) becomes the solution; False if the matrix (n, n) is singular.
+
+    Far quicker to compile than a call of LAPACK, and as quick to run at this size.
+    """
+    count = len(matrix)
+    for k in range(count):
+        pivot = k
+        for i in range(k + 1, count):
+            if abs(matrix[i, k]) > abs(matrix[pivot, k]):
+                pivot = i
+        if not abs(matrix[pivot, k]) > 0.0:
+            return False
+        for j in range(count):
+            matrix[k, j], matrix[pivot, j] = matrix[pivot, j], matrix[k, j]
+        for j in range(right.shape[1]):
+            right[k, j], right[pivot, j] = right[pivot, j], right[k, j]
+        for i in range(count):
+            if i != k:
+                share = matrix[i, k] / matrix[k, k]
+                for j in range(k, count):
+                    matrix[i, j] -= share * matrix[k, j]
+                for j in range(right.shape[1]):
+                    right[i, j] -= share * right[k, j]
+    for k in range(count):
+        for j in range(right.shape[1]):
+            right[k, j] /= matrix[k, k]
+    return True
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -74,16 +105,28 @@ def _state(
                     return -1.0
                 gram[j, i], first[j, i] = gram[i, j].conjugate(), -first[i, j].conjugate()
                 second[j, i] = second[i, j].conjugate()
-    height[:] = np.linalg.solve(gram, b)
-    left = slope - first @ height
-    # <d_k, d_l> less what the templates themselves take of it
-    projected = -second + first @ np.linalg.solve(gram, first)
+    solved = np.empty((count, count + 1), dtype=np.complex128)
+    for i in range(count):
+        solved[i, count] = b[i]
+        for j in range(count):
+            solved[i, j] = first[i, j]
+    if not eliminate(gram, solved):
+        return -1.0
     explained = 0.0
     for i in range(count):
+        height[i] = solved[i, count]
         explained += (b[i].conjugate() * height[i]).real
-        right[i] = (height[i].conjugate() * left[i]).real
+    for i in range(count):
+        left = slope[i]
+        for k in range(count):
+            left -= first[i, k] * height[k]
+        right[i] = (height[i].conjugate() * left).real
         for j in range(count):
-            normal[i, j] = (height[i].conjugate() * height[j] * projected[i, j]).real
+            # <d_i, d_j> less what the templates themselves take of it
+            projected = -second[i, j]
+            for k in range(count):
+                projected += first[i, k] * solved[k, j]
+            normal[i, j] = (height[i].conjugate() * height[j] * projected).real
     return explained
 
 
@@ -111,18 +154,23 @@ def fit_echoes(
     if explained < 0:
         return -1.0
     damping = 1e-3
+    damped, change, trial = np.empty((count, count)), np.empty((count, 1)), np.empty(count)
     for _ in range(ROUNDS):
-        damped = normal.copy()
         for i in range(count):
-            damped[i, i] = damped[i, i] * (1 + damping) + 1e-30
-        if not math.isfinite(np.sum(damped)) or np.linalg.det(damped) == 0.0:
+            change[i, 0] = right[i]
+            for j in range(count):
+                damped[i, j] = normal[i, j] * (1 + damping if i == j else 1.0)
+        if not eliminate(damped, change):
             return -1.0
-        change = np.linalg.solve(damped, right)
-        trial = np.minimum(np.maximum(angles + change, least), most)
+        for i in range(count):
+            trial[i] = min(max(angles[i] + change[i, 0], least), most)
         reached = _state(products, pulse, centre, trial, trial_height, trial_normal, trial_right)
         if reached > explained:
             settled = reached - explained < 1e-9 * reached
-            angles[:], height[:], normal[:], right[:] = trial, trial_height, trial_normal, trial_right
+            for i in range(count):
+                angles[i], height[i], right[i] = trial[i], trial_height[i], trial_right[i]
+                for j in range(count):
+                    normal[i, j] = trial_normal[i, j]
             explained = reached
             damping = max(0.2 * damping, 1e-9)
             if settled:
@@ -132,8 +180,6 @@ def fit_echoes(
             if damping > 1e9:
                 break
     for i in range(count):
-        normal[i, i] += 1e-30
-    if not math.isfinite(np.sum(normal)) or np.linalg.det(normal) == 0.0:
-        return -1.0
-    covariance[:] = np.linalg.inv(normal)
-    return explained
+        for j in range(count):
+            covariance[i, j] = 1.0 if i == j else 0.0
+    return explained if eliminate(normal, covariance) else -1.0

@@ -55,7 +55,7 @@ def onset_parabola(echoes: np.ndarray) -> np.ndarray:
 
 
 def correlated(echoes: np.ndarray, template: np.ndarray, origin: float, finer: int = 8) -> np.ndarray:
-    """Highest sample of scipy.signal.correlate with the template, both resampled, and a parabola: no envelope at all."""
+    """Highest sample of scipy.signal.correlate with the template, both resampled, and a parabola, no envelope."""
     out = np.empty(len(echoes))
     fine_template = signal.resample(template, finer * len(template))
     for n, row in enumerate(signal.resample(echoes, finer * echoes.shape[1], axis=1)):

@@ -13,11 +13,12 @@ from comparison.pulses import RATE_HZ, SPEED_MM_PER_S, Pulse, noise_of, resonant
 from echolume_messages.calibration import ArrayCalibration
 from echolume_processing.ping import Ping
 from echolume_processing.ultrasonic import pipeline as chain
+from echolume_processing.ultrasonic.baseband import Baseband, baseband
 from echolume_processing.ultrasonic.contact import contact
 from echolume_processing.ultrasonic.cycles import settle_cycles
 from echolume_processing.ultrasonic.envelope import band_pass, paper_envelope
 from echolume_processing.ultrasonic.flight import Arrivals, first_arrivals
-from echolume_processing.ultrasonic.matched_filter import PLAIN, Baseband, MatchedFilter, matched_filter
+from echolume_processing.ultrasonic.matched_filter import PLAIN, MatchedFilter, matched_filter
 from echolume_processing.ultrasonic.onset import leading_edge, onsets
 from echolume_processing.ultrasonic.several import several_echoes
 from echolume_processing.ultrasonic.templates import cut_templates
@@ -57,13 +58,11 @@ def filter_of(
     pulse: Pulse, band_hz: tuple[float, float], channels: int, whitening: float | None = PLAIN
 ) -> MatchedFilter:
     one = band_pass(template_of(pulse)[None].astype(np.float32), RATE_HZ, *band_hz)
-    return matched_filter(
-        np.tile(one, (channels, 1)), ORIGIN, RATE_HZ, band_hz, pulse.samples, whitening=whitening
-    )
+    return matched_filter(np.tile(one, (channels, 1)), ORIGIN, RATE_HZ, band_hz, pulse.samples, whitening=whitening)
 
 
 def found_in(echoes: np.ndarray, bank: MatchedFilter) -> tuple[Baseband, Arrivals]:
-    base = bank.baseband(echoes.astype(np.float32))
+    base = baseband(bank, echoes.astype(np.float32))
     level = np.full(base.magnitude.shape[1], 0.45, dtype=np.float32)
     return base, first_arrivals(base, GATE_S, level, strongest=True)
 
@@ -292,7 +291,7 @@ def range_rows(pings: int = 300) -> dict[str, float]:
         at = np.stack([points[n] for n in ("x_mm", "y_mm", "z_mm")], axis=1)
         errors.append(float(np.median(at @ normal)) - distance if len(at) else np.inf)
     figure = float(np.sqrt(np.mean(np.square(errors))))
-    print(f"\nPlate at 400 mm, 20 dB, 8-cycle pulse, counts to points: range rms {figure:.4f} mm of {pings} pings, ", end="")
+    print(f"\nPlate at 400 mm, 20 dB, 8-cycle pulse, counts to points, {pings} pings: range rms {figure:.4f} mm,")
     print(f"largest {np.abs(errors).max():.3f} mm; Barshan and Sekmen 1999: {BARSHAN_MM} mm")
     return {"range_mm_20db": figure}
 
@@ -331,8 +330,9 @@ def ping_rows(seconds: float = 6.0) -> dict[str, float]:
     print("\nA ping of 8 x 4096 int16, one thread")
     for name, value in ms.items():
         print(f"{name:38}{value:8.3f} ms{value / floor:8.1f} x")
-    print(f"{'echolume without the contact points':38}{all_ms - contact_ms:8.3f} ms{(all_ms - contact_ms) / floor:8.1f} x")
-    return {"ping_ms": all_ms, "ping_ms_without_contact": all_ms - contact_ms, "ping_x_floor": all_ms / floor}
+    rest_ms = all_ms - contact_ms
+    print(f"{'echolume without the contact points':38}{rest_ms:8.3f} ms{rest_ms / floor:8.1f} x")
+    return {"ping_ms": all_ms, "ping_ms_without_contact": rest_ms, "ping_x_floor": all_ms / floor}
 
 
 def echoes_rows() -> dict[str, float]:

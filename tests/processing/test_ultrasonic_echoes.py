@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from echolume_messages.rig import ArrayElementLayout
 from echolume_messages.types import EchoKind
-from echolume_processing.ultrasonic import contact, envelope, flight, lobes, matched_filter
+from echolume_processing.ultrasonic import baseband, contact, envelope, flight, lobes, matched_filter
 
 RATE_HZ = 250e3
 RECEIVERS = np.array(ArrayElementLayout().receivers_mm)
@@ -28,7 +28,7 @@ def filter_bank(samples: int = 1024) -> matched_filter.MatchedFilter:
 
 def arrivals(waveform: np.ndarray, **keywords: bool) -> flight.Arrivals:
     bank = filter_bank()
-    echoes = bank.baseband(waveform[None].astype(np.float32))
+    echoes = baseband.baseband(bank, waveform[None].astype(np.float32))
     threshold = np.full(echoes.magnitude.shape[1], 0.45, dtype=np.float32)
     return flight.first_arrivals(echoes, (100 / RATE_HZ, 1000 / RATE_HZ), threshold, **keywords)
 
@@ -69,7 +69,7 @@ def test_energy_from_the_band_is_that_below_the_paper_envelope(first: int):
     )
     defined = envelope.band_pass(waves, RATE_HZ, 30e3, 60e3)[:, first:]
     defined = envelope.energy(envelope.paper_envelope(defined, RATE_HZ), RATE_HZ)
-    assert bank.baseband(waves).energy(first / RATE_HZ, 2048 / RATE_HZ) == pytest.approx(defined, rel=0.02)
+    assert baseband.baseband(bank, waves).energy(first / RATE_HZ, 2048 / RATE_HZ) == pytest.approx(defined, rel=0.02)
 
 
 def test_the_band_pass_keeps_the_band_and_its_timing():

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from processing.echo_pulses import F_HZ, LENGTH, RATE_HZ, SPEED_MM_PER_S, wideband
 
 from echolume_processing.ultrasonic import excitation
 from echolume_processing.ultrasonic.matched_filter import PLAIN, matched_filter
+from processing.echo_pulses import F_HZ, LENGTH, RATE_HZ, SPEED_MM_PER_S, wideband
 
 BAND_HZ = (30e3, 60e3)
 DRIVES = {
@@ -28,7 +28,8 @@ def compressed(name: str) -> tuple[np.ndarray, float, float]:
     """Magnitude of an echo at sample 500.3, its rate, and the noise's gain."""
     template = heard(DRIVES[name], 60.0)[:, : len(DRIVES[name]) + 120].astype(np.float32)
     bank = matched_filter(template, 60.0, RATE_HZ, BAND_HZ, LENGTH // 2, whitening=PLAIN)
-    return np.abs(bank.compress(heard(DRIVES[name], 500.3).astype(np.float32)))[0], 4 * RATE_HZ, float(bank.noise_gain[0])
+    out = bank.compress(heard(DRIVES[name], 500.3).astype(np.float32))[0]
+    return np.abs(out), 4 * RATE_HZ, float(bank.noise_gain[0])
 
 
 def width_mm(magnitude: np.ndarray, rate_hz: float) -> float:

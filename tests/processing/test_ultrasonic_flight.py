@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from processing.echo_pulses import ORIGIN, RATE_HZ, SAMPLES, SPEED_MM_PER_S, bounds_s, echoes, resonant, wideband
 
 from echolume_messages.calibration import ArrayCalibration
 from echolume_messages.types import EchoKind
 from echolume_processing.ping import Ping
+from echolume_processing.ultrasonic.baseband import baseband
 from echolume_processing.ultrasonic.cycles import settle_cycles
 from echolume_processing.ultrasonic.envelope import band_pass
 from echolume_processing.ultrasonic.flight import Arrivals, first_arrivals
@@ -16,6 +16,7 @@ from echolume_processing.ultrasonic.matched_filter import PLAIN, MatchedFilter, 
 from echolume_processing.ultrasonic.onset import LeadingEdge, leading_edge, onsets
 from echolume_processing.ultrasonic.pipeline import UltrasonicPipeline
 from echolume_processing.ultrasonic.templates import cut_templates
+from processing.echo_pulses import ORIGIN, RATE_HZ, SAMPLES, SPEED_MM_PER_S, bounds_s, echoes, resonant, wideband
 
 CHANNELS = 300
 NARROW_HZ, WIDE_HZ = (36e3, 44e3), (30e3, 60e3)
@@ -37,7 +38,7 @@ def bank_of(name: str, whitening: float = PLAIN) -> MatchedFilter:
 
 
 def found_in(waves: np.ndarray, bank: MatchedFilter) -> Arrivals:
-    base = bank.baseband(waves.astype(np.float32))
+    base = baseband(bank, waves.astype(np.float32))
     level = np.full(base.magnitude.shape[1], 0.45, dtype=np.float32)
     return first_arrivals(base, GATE_S, level, strongest=True)
 

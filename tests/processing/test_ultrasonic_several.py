@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from processing.echo_pulses import ORIGIN, RATE_HZ, SAMPLES, SPEED_MM_PER_S, echoes, resonant
 
+from echolume_processing.ultrasonic.baseband import baseband
 from echolume_processing.ultrasonic.envelope import band_pass
 from echolume_processing.ultrasonic.matched_filter import PLAIN, MatchedFilter, matched_filter
 from echolume_processing.ultrasonic.several import Echoes, several_echoes
+from processing.echo_pulses import ORIGIN, RATE_HZ, SAMPLES, SPEED_MM_PER_S, echoes, resonant
 
 CHANNELS = 100
 BAND_HZ = (36e3, 44e3)
@@ -24,11 +25,11 @@ def bank() -> MatchedFilter:
 
 
 def found_in(waves: np.ndarray, noise: float, bank: MatchedFilter) -> list[Echoes]:
-    return several_echoes(bank.baseband(waves.astype(np.float32)), GATE_S, noise * bank.noise_gain)
+    return several_echoes(baseband(bank, waves.astype(np.float32)), GATE_S, noise * bank.noise_gain)
 
 
 def two(apart_mm: float, rng: np.random.Generator, noise: float) -> tuple[np.ndarray, np.ndarray]:
-    """Echoes (channels, samples) of random relative phase within 6 dB of each other, and their arrivals (channels, 2)."""
+    """Echoes (channels, samples) of random phase within 6 dB of each other, and their arrivals (channels, 2)."""
     at = rng.uniform(280, 320, CHANNELS)
     both = np.stack([at, at + apart_mm / MM * RATE_HZ], axis=1)
     height = 10 ** (rng.uniform(-6, 6, CHANNELS) / 20) * np.exp(2j * np.pi * rng.uniform(size=CHANNELS))

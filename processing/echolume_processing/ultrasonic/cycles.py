@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from echolume_messages.geometry import Points3, require_shape
 from echolume_processing.ultrasonic.cycle_kernels import settle
+from echolume_processing.ultrasonic.flight import LEAST_NOISE, Arrivals
 
+ENVELOPE_FLOOR_MM = 0.2
+"""What the model leaves unexplained of a path by its envelope alone."""
+MAX_CHI_SQUARED = 6.0
+MIN_MARGIN = 9.0
+"""Cycles that all channels agree on: how well they fit a surface, and how much worse the next choice is."""
 MIN_CHANNELS = 5
 """Three unknowns, and two more to contradict a wrong cycle."""
 
@@ -81,3 +87,45 @@ def settle_cycles(
     paths[known] = best
     chi_squared = float(scores[0]) / (count - 3)
     return Settled(paths, chi_squared, float(scores[2] - scores[1]) if np.isfinite(chi_squared) else 0.0)
+
+
+def settled(
+    found: Arrivals,
+    paths_mm: NDArray[np.float64],
+    receivers_mm: Points3,
+    period_s: NDArray[np.float64],
+    speed_mm_per_s: float,
+    floor_mm: float,
+) -> tuple[Arrivals, NDArray[np.float64]]:
+    """Arrivals and paths after all channels have settled their cycles together; unchanged where no surface fits.
+
+    Parameters
+    ----------
+    found : Arrivals
+    paths_mm : (receivers,) float64
+    receivers_mm : (receivers, 3) float64
+        Relative to the emitter.
+    period_s : (receivers,) float64
+        Of each channel's compressed pulse.
+    speed_mm_per_s : float
+    floor_mm : float
+        What a smooth surface leaves unexplained of a path.
+    """
+    envelope_mm = paths_mm + (found.envelope_s - found.time_s) * speed_mm_per_s
+    envelope_sigma_mm = np.hypot(found.envelope_sigma_s * speed_mm_per_s, ENVELOPE_FLOOR_MM)
+    doubtful = found.doubtful
+    turned_s = np.where(doubtful, -found.phase_rad / (2 * np.pi) * period_s, 0.0)
+    wavelength_mm = float(period_s.mean()) * speed_mm_per_s
+    agreed = settle_cycles(
+        receivers_mm, envelope_mm, envelope_sigma_mm, paths_mm + turned_s * speed_mm_per_s, floor_mm, wavelength_mm
+    )
+    if agreed.chi_squared > MAX_CHI_SQUARED or agreed.margin < MIN_MARGIN:
+        return found, paths_mm
+    relative = np.maximum(found.noise / np.where(found.found, found.amplitude, 1.0), LEAST_NOISE)
+    after = replace(
+        found,
+        time_s=found.time_s + (agreed.paths_mm - paths_mm) / speed_mm_per_s,
+        phase_rad=np.where(doubtful, 0.0, found.phase_rad),
+        sigma_s=np.where(doubtful, relative * period_s / (2 * np.pi), found.sigma_s),
+    )
+    return after, agreed.paths_mm

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echolume_messages.geometry import require_shape
+from echolume_processing.ultrasonic.baseband import Baseband
 from echolume_processing.ultrasonic.echo_kernels import refine, search
-from echolume_processing.ultrasonic.matched_filter import Baseband
 
 MAX_PHASE_RAD = 2.2
 """Phase at the envelope's peak beyond which phase and envelope contradict each other (a cycle is 6.28)."""

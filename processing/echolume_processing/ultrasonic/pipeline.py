@@ -12,20 +12,20 @@ from echolume_messages.geometry import apply, require_shape, robot_from_flange
 from echolume_messages.types import ULTRASONIC_POINT, EchoBlock, Structured
 from echolume_processing.ping import Ping
 from echolume_processing.ultrasonic.air import carried_mps
+from echolume_processing.ultrasonic.baseband import Baseband, baseband
 from echolume_processing.ultrasonic.contact import contact
-from echolume_processing.ultrasonic.cycles import settle_cycles
-from echolume_processing.ultrasonic.echo_kernels import without_offset
+from echolume_processing.ultrasonic.cycles import settled
 from echolume_processing.ultrasonic.envelope import Waveforms, energy, paper_envelope
-from echolume_processing.ultrasonic.flight import LEAST_NOISE, MAX_PHASE_RAD, Arrivals, first_arrivals
+from echolume_processing.ultrasonic.flight import MAX_PHASE_RAD, Arrivals, first_arrivals
 from echolume_processing.ultrasonic.matched_filter import (
     PLAIN,
-    Baseband,
     ComplexEnvelope,
     MatchedFilter,
     matched_filter,
     padded_length,
 )
 from echolume_processing.ultrasonic.onset import leading_edge, onsets
+from echolume_processing.ultrasonic.record_kernels import without_offset
 from echolume_processing.ultrasonic.several import Echoes, several_echoes
 
 MIN_PATH_MM = 110.0
@@ -36,11 +36,6 @@ SURFACE = 0.45
 little less to keep bars narrower than the Fresnel zone."""
 PATH_FLOOR_MM = 0.05
 """What the model leaves unexplained of a path on a clean plane."""
-ENVELOPE_FLOOR_MM = 0.2
-"""The same of a path by its envelope alone."""
-MAX_CHI_SQUARED = 6.0
-MIN_MARGIN = 9.0
-"""Cycles that all channels agree on: how well they fit a surface, and how much worse the next choice is."""
 UPSAMPLING = 4
 
 
@@ -124,37 +119,6 @@ class UltrasonicPipeline:
         echoes, cut_s = self._baseband(waveforms, sample_rate_hz, start_s, speed, gate)
         return self._arrivals(waveforms, echoes, cut_s, start_s, speed, gate, strongest)
 
-    def settled(
-        self, found: Arrivals, paths_mm: NDArray[np.float64], speed_mm_per_s: float
-    ) -> tuple[Arrivals, NDArray[np.float64]]:
-        """Arrivals and paths after all channels have settled their cycles together; unchanged where no surface fits."""
-        period_s = 1 / self._bank(self._templates.shape[1], self.calibration.sample_rate_hz).centre_hz
-        envelope_mm = paths_mm + (found.envelope_s - found.time_s) * speed_mm_per_s
-        doubtful = found.doubtful
-        turned_s = np.where(doubtful, -found.phase_rad / (2 * np.pi) * period_s, 0.0)
-        sigma_s = np.hypot(found.envelope_sigma_s, ENVELOPE_FLOOR_MM / speed_mm_per_s)
-        phase_mm = paths_mm + turned_s * speed_mm_per_s
-        agreed = settle_cycles(
-            self._receivers_mm,
-            envelope_mm,
-            sigma_s * speed_mm_per_s,
-            phase_mm,
-            PATH_FLOOR_MM,
-            float(period_s.mean()) * speed_mm_per_s,
-        )
-        if agreed.chi_squared > MAX_CHI_SQUARED or agreed.margin < MIN_MARGIN:
-            return found, paths_mm
-        change_s = (agreed.paths_mm - paths_mm) / speed_mm_per_s
-        relative = np.maximum(found.noise / np.where(found.found, found.amplitude, 1.0), LEAST_NOISE)
-        sigma_s = np.where(found.found, relative * period_s / (2 * np.pi), np.nan)
-        settled = replace(
-            found,
-            time_s=found.time_s + change_s,
-            phase_rad=np.where(doubtful, 0.0, found.phase_rad),
-            sigma_s=np.where(doubtful, sigma_s, found.sigma_s),
-        )
-        return settled, agreed.paths_mm
-
     def several_echoes(
         self,
         waveforms: Waveforms,
@@ -220,7 +184,8 @@ class UltrasonicPipeline:
         echoes, cut_s = self._baseband(waveforms, sample_rate_hz, start_s, speed, self._gate_mm)
         found, paths_mm = self._arrivals(waveforms, echoes, cut_s, start_s, speed, self._gate_mm, strongest=False)
         if found.doubtful.any():
-            found, paths_mm = self.settled(found, paths_mm, speed)
+            period_s = 1 / echoes.bank.centre_hz
+            found, paths_mm = settled(found, paths_mm, self._receivers_mm, period_s, speed, PATH_FLOOR_MM)
         sigma_mm = np.hypot(PATH_FLOOR_MM, np.where(found.found, found.sigma_s * speed, 0.0))
         result = contact(self._receivers_mm, paths_mm, sigma_mm)
         pose = self.rig_from_array(robot_pose)
@@ -257,7 +222,7 @@ class UltrasonicPipeline:
         first = min(max(0, int(edges_s[0] * sample_rate_hz) - margin), waveforms.shape[1])
         last = max(first, min(waveforms.shape[1], int(edges_s[1] * sample_rate_hz) + 2 * margin))
         bank = self._bank(last - first, sample_rate_hz, whitening)
-        return bank.baseband(waveforms[:, first:last]), first / sample_rate_hz
+        return baseband(bank, waveforms[:, first:last]), first / sample_rate_hz
 
     def _arrivals(
         self,

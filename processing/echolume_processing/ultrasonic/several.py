@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from echolume_processing.ultrasonic.matched_filter import Baseband
+from echolume_processing.ultrasonic.baseband import Baseband
 from echolume_processing.ultrasonic.several_kernels import fit_echoes, pair_start
 
 WORTH_A_TRY = 4.0

@@ -23,6 +23,7 @@ from echolume_processing.ultrasonic.record_kernels import (
 
 PER_BAND = 1.6
 """Samples of the baseband for each one that its width needs."""
+FREEDOM = 1.4
 NOISE_BINS = 256
 """Bins in the band's middle that tell the noise to 4 %."""
 
@@ -91,7 +92,10 @@ class Baseband:
         out = np.empty(receivers)
         quietest(magnitude_of(padded), first, max(first, last), out)
         passed = bank.taper[begin : begin + kept].astype(np.float64)
-        return out * np.sqrt(bank.length / (2 * np.sum(passed**2)))
+        # As Student's t: errors over a sigma from few values scatter by more than 1. The half's mean square is worth
+        # FREEDOM degrees of freedom for each independent value.
+        freedom = max(FREEDOM * (last - first) * kept / padded.shape[1], 4.0)
+        return out * np.sqrt(bank.length / (2 * np.sum(passed**2)) * freedom / (freedom - 2))
 
     def energy(self, first_s: float, last_s: float) -> NDArray[np.float64]:
         """Energy below the paper's envelope of the band-passed record between two times, per channel (receivers,).

@@ -43,7 +43,7 @@ TARGETS: Mapping[str, tuple[float, float]] = {
     "template_bias_mm": (0.05, 0.05),
     "amplitude_shift_mm": (0.01, 0.01),
     "two_echo_20mm_pct": (95, 95),
-    "two_echo_15mm_pct": (90, 95),
+    "two_echo_15mm_pct": (95, 95),
     "range_mm_20db": (BARSHAN_MM, BARSHAN_MM / 3),
     "ping_ms": (1, 0.5),
 }

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from echolume_messages.rig import ArrayElementLayout
 from echolume_messages.types import EchoKind
-from echolume_processing.ultrasonic import contact, envelope, flight, lobes
+from echolume_processing.ultrasonic import baseband, contact, envelope, flight, lobes, matched_filter
 
 RATE_HZ = 250e3
 RECEIVERS = np.array(ArrayElementLayout().receivers_mm)
@@ -21,16 +21,16 @@ def pulse(arrival: float, samples: int = 1024) -> np.ndarray:
     return np.fft.irfft(band * np.exp(-2j * np.pi * f * arrival / RATE_HZ), samples)
 
 
-def filter_bank(samples: int = 1024) -> envelope.MatchedFilter:
+def filter_bank(samples: int = 1024) -> matched_filter.MatchedFilter:
     template = np.tile(pulse(ORIGIN, 200), (1, 1)).astype(np.float32)
-    return envelope.matched_filter(template, ORIGIN, RATE_HZ, (30e3, 60e3), samples)
+    return matched_filter.matched_filter(template, ORIGIN, RATE_HZ, (30e3, 60e3), samples)
 
 
 def arrivals(waveform: np.ndarray, **keywords: bool) -> flight.Arrivals:
     bank = filter_bank()
-    compressed = bank.compress(waveform[None].astype(np.float32))
-    threshold = np.full(compressed.shape[1], 0.45, dtype=np.float32)
-    return flight.first_arrivals(compressed, bank, 4 * RATE_HZ, (400, 4000), threshold, **keywords)
+    echoes = baseband.baseband(bank, waveform[None].astype(np.float32))
+    threshold = np.full(echoes.magnitude.shape[1], 0.45, dtype=np.float32)
+    return flight.first_arrivals(echoes, (100 / RATE_HZ, 1000 / RATE_HZ), threshold, **keywords)
 
 
 def test_the_paper_envelope_of_a_tone_is_its_amplitude_without_delay():
@@ -43,14 +43,33 @@ def test_the_paper_envelope_of_a_tone_is_its_amplitude_without_delay():
     assert rise / RATE_HZ == pytest.approx(2e-3, abs=0.1e-3)  # undelayed; uncompensated it would be 0.32 ms late
 
 
-def test_the_paper_envelope_survives_decimation():
+@pytest.mark.parametrize("kind", ["burst", "short pulse", "slow hump"])
+def test_the_paper_envelope_survives_decimation(kind: str):
     t = np.arange(4096) / RATE_HZ
-    wave = (np.exp(-(((t - 8e-3) / 1e-3) ** 2)) * np.sin(2 * np.pi * 40e3 * t))[None].astype(np.float32)
-    full = envelope.paper_envelope(wave, RATE_HZ)
+    waves = {
+        "burst": np.where((t > 2e-3) & (t < 5e-3), np.sin(2 * np.pi * 40e3 * t), 0.0),
+        "short pulse": pulse(1500.3, 4096),
+        "slow hump": np.exp(-(((t - 8e-3) / 1e-3) ** 2)) * np.sin(2 * np.pi * 40e3 * t),
+    }
+    full = envelope.paper_envelope(waves[kind][None].astype(np.float32), RATE_HZ)
     few, rate = envelope.decimated(full, RATE_HZ)
-    back = np.interp(t, np.arange(few.shape[1]) / rate, few[0])
-    assert few.shape[1] < 140
-    assert np.max(np.abs(back - full[0])) < 0.05 * full.max()
+    back = envelope.restored(few, rate, 4096, RATE_HZ)
+    assert few.shape[1] == 410
+    assert back.dtype == np.float32
+    assert np.max(np.abs(back - full)[0, :4090]) < 0.002 * full.max()
+
+
+@pytest.mark.parametrize("first", [0, 700])
+def test_energy_from_the_band_is_that_below_the_paper_envelope(first: int):
+    rng = np.random.default_rng(4)
+    waves = np.stack([pulse(at, 2048) + h * pulse(at + 300.4, 2048) for at, h in ((850.2, 0.5), (1000.9, 1.3))])
+    waves = (waves + rng.normal(0, 0.01, waves.shape)).astype(np.float32)
+    bank = matched_filter.matched_filter(
+        np.tile(pulse(ORIGIN, 200), (2, 1)).astype(np.float32), ORIGIN, RATE_HZ, (30e3, 60e3), 2048
+    )
+    defined = envelope.band_pass(waves, RATE_HZ, 30e3, 60e3)[:, first:]
+    defined = envelope.energy(envelope.paper_envelope(defined, RATE_HZ), RATE_HZ)
+    assert baseband.baseband(bank, waves).energy(first / RATE_HZ, 2048 / RATE_HZ) == pytest.approx(defined, rel=0.02)
 
 
 def test_the_band_pass_keeps_the_band_and_its_timing():

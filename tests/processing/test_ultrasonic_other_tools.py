@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import fftconvolve
 
-from echolume_processing.ultrasonic import contact, envelope, flight
+from echolume_processing.ultrasonic import baseband, contact, flight, matched_filter
 from processing import other_tools
 from processing.other_tools import (
     POINT_RATE_HZ,
@@ -61,11 +61,11 @@ def measured_paths_mm(
     origin = 1e-3 * float(reference_mm.mean()) / SPEED_MPS * rate_hz
     first = int(origin) - 160
     templates = np.ascontiguousarray(reference[:, first : first + 400]).astype(np.float32)
-    bank = envelope.matched_filter(templates, origin - first, rate_hz, BAND_HZ, SAMPLES)
-    compressed = bank.compress(np.asarray(echoes, dtype=np.float32))
-    threshold = np.full(compressed.shape[1], 1e-3, dtype=np.float32)
-    gate = (800, compressed.shape[1] - 800)
-    heard = flight.first_arrivals(compressed, bank, bank.upsampling * rate_hz, gate, threshold, strongest=True)
+    bank = matched_filter.matched_filter(templates, origin - first, rate_hz, BAND_HZ, SAMPLES)
+    compressed = baseband.baseband(bank, np.asarray(echoes, dtype=np.float32))
+    threshold = np.full(compressed.magnitude.shape[1], 1e-3, dtype=np.float32)
+    gate_s = (200 / rate_hz, (SAMPLES - 200) / rate_hz)
+    heard = flight.first_arrivals(compressed, gate_s, threshold, strongest=True)
     assert heard.found.all()
     # A template's own arrival differs from the mean by its path less the mean path.
     return 1e3 * SPEED_MPS * heard.time_s + reference_mm - reference_mm.mean()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, product
 from typing import Literal
 
@@ -12,9 +12,15 @@ from numpy.typing import NDArray
 from echolume_messages.geometry import Points3, require_shape
 from echolume_messages.types import EchoKind
 from echolume_processing.ultrasonic.contacts import MAX_CHI_SQUARED, MAX_TILT_RAD, contacts
+from echolume_processing.ultrasonic.flight import LEAST_NOISE, Arrivals
+from echolume_processing.ultrasonic.layout import layout_of
 
 SURE = 9.0
 """By this much of chi-squared the best answer must beat the next."""
+ENVELOPE_FLOOR_MM = 0.2
+"""What the model leaves unexplained of a path by its envelope alone."""
+MIN_CHANNELS = 5
+"""Three unknowns, and two more to contradict a wrong cycle."""
 MODELS: tuple[Literal["plane"], Literal["point"]] = ("plane", "point")
 
 
@@ -139,3 +145,50 @@ def resolve_cycles(
     believed = bool(surface[best] <= MAX_CHI_SQUARED)
     kind = EchoKind(int(fits.kind[best])) if believed else EchoKind.NONE
     return Cycles(whole[best], ways[best], kind, float(surface[best]), margin)
+
+
+def settled(
+    found: Arrivals,
+    paths_mm: NDArray[np.float64],
+    receivers_mm: Points3,
+    period_s: NDArray[np.float64],
+    speed_mm_per_s: float,
+    floor_mm: float,
+) -> tuple[Arrivals, NDArray[np.float64]]:
+    """Arrivals and paths after all channels have settled their cycles together; unchanged where no surface fits.
+
+    Parameters
+    ----------
+    found : Arrivals
+    paths_mm : (receivers,) float64
+    receivers_mm : (receivers, 3) float64
+        Relative to the emitter.
+    period_s : (receivers,) float64
+        Of each channel's compressed pulse.
+    speed_mm_per_s : float
+    floor_mm : float
+        What a smooth surface leaves unexplained of a path.
+    """
+    doubtful = found.doubtful
+    heard = np.isfinite(paths_mm)
+    if np.count_nonzero(heard) < MIN_CHANNELS or layout_of(receivers_mm[heard]).rank < 3:
+        return found, paths_mm
+    turned_s = np.where(doubtful, -found.phase_rad / (2 * np.pi) * period_s, 0.0)
+    agreed = resolve_cycles(
+        receivers_mm,
+        paths_mm + turned_s * speed_mm_per_s,
+        np.full(len(paths_mm), floor_mm),
+        float(period_s.mean()) * speed_mm_per_s,
+        paths_mm + (found.envelope_s - found.time_s) * speed_mm_per_s,
+        np.hypot(found.envelope_sigma_s * speed_mm_per_s, ENVELOPE_FLOOR_MM),
+    )
+    if not agreed.resolved:
+        return found, paths_mm
+    relative = np.maximum(found.noise / np.where(found.found, found.amplitude, 1.0), LEAST_NOISE)
+    after = replace(
+        found,
+        time_s=found.time_s + (agreed.paths_mm - paths_mm) / speed_mm_per_s,
+        phase_rad=np.where(doubtful, 0.0, found.phase_rad),
+        sigma_s=np.where(doubtful, relative * period_s / (2 * np.pi), found.sigma_s),
+    )
+    return after, agreed.paths_mm

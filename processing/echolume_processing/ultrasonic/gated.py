@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from echolume_messages.geometry import Points3, apply, require_shape
 from echolume_processing.ping import Ping
-from echolume_processing.ultrasonic.envelope import ComplexEnvelope, band_weights
+from echolume_processing.ultrasonic.envelope import band_weights
+from echolume_processing.ultrasonic.matched_filter import ComplexEnvelope
 from echolume_processing.ultrasonic.pipeline import (
     UPSAMPLING,
     UltrasonicPipeline,

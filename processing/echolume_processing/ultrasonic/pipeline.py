@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,17 +12,21 @@ from echolume_messages.geometry import apply, require_shape, robot_from_flange
 from echolume_messages.types import ULTRASONIC_POINT, EchoBlock, Structured
 from echolume_processing.ping import Ping
 from echolume_processing.ultrasonic.air import carried_mps
+from echolume_processing.ultrasonic.baseband import Baseband, baseband
 from echolume_processing.ultrasonic.contact import contact
-from echolume_processing.ultrasonic.envelope import (
+from echolume_processing.ultrasonic.cycles import settled
+from echolume_processing.ultrasonic.envelope import Waveforms, energy, paper_envelope
+from echolume_processing.ultrasonic.flight import MAX_PHASE_RAD, Arrivals, first_arrivals
+from echolume_processing.ultrasonic.matched_filter import (
+    PLAIN,
     ComplexEnvelope,
     MatchedFilter,
-    Waveforms,
-    band_pass,
-    energy,
     matched_filter,
-    paper_envelope,
+    padded_length,
 )
-from echolume_processing.ultrasonic.flight import MAX_PHASE_RAD, Arrivals, first_arrivals
+from echolume_processing.ultrasonic.onset import leading_edge, onsets
+from echolume_processing.ultrasonic.record_kernels import without_offset
+from echolume_processing.ultrasonic.several import Echoes, several_echoes
 
 MIN_PATH_MM = 110.0
 """Shorter paths drown in the cross-talk and its ringing."""
@@ -39,10 +45,11 @@ def speed_of_sound_mps(calibration: ArrayCalibration, air_temperature_c: float) 
 
 
 def waveforms_from_counts(echoes: EchoBlock) -> Waveforms:
-    """Digitiser counts (receivers, samples) to float32 without each channel's offset."""
+    """Digitiser counts (receivers, samples) to float32 without each channel's mean."""
     require_shape("echoes", echoes, (None, None))
-    floats = echoes.astype(np.float32)
-    return floats - np.median(floats, axis=1, keepdims=True)
+    out = np.empty(echoes.shape, dtype=np.float32)
+    without_offset(echoes, out)
+    return out
 
 
 class UltrasonicPipeline:
@@ -53,19 +60,30 @@ class UltrasonicPipeline:
     calibration : Calibration or ArrayCalibration
     surface : float
         Share of the reference plate's amplitude that counts as the first echo of a surface.
+    gate_mm : (shortest, longest)
+        Paths that may be a surface's.
     """
 
-    def __init__(self, calibration: Calibration | ArrayCalibration, surface: float = SURFACE) -> None:
+    def __init__(
+        self,
+        calibration: Calibration | ArrayCalibration,
+        surface: float = SURFACE,
+        gate_mm: tuple[float, float] = (MIN_PATH_MM, MAX_PATH_MM),
+    ) -> None:
         self.calibration = calibration.array if isinstance(calibration, Calibration) else calibration
         found = self.calibration
         self._templates = np.array(found.templates, dtype=np.float32)
         self._delays_s = np.array(found.delays_s, dtype=np.float64)
         self._emitter_mm = np.array(found.emitter_mm, dtype=np.float64)
         self._receivers_mm = np.array(found.receivers_mm, dtype=np.float64) - self._emitter_mm
+        self._robot_pose, self._array_pose = found.robot_pose, found.array_pose
         self._surface = surface
-        self._banks: dict[int, MatchedFilter] = {}
+        self._gate_mm = gate_mm
+        self._banks: dict[tuple[int, float | None], MatchedFilter] = {}
         whole = energy(paper_envelope(self._templates, found.sample_rate_hz), found.sample_rate_hz)
         self._template_energy = np.maximum(whole, np.finfo(np.float64).tiny)
+        centre_hz = self._bank(self._templates.shape[1], found.sample_rate_hz).centre_hz
+        self._edge = leading_edge(self._templates, found.template_origin, found.sample_rate_hz, centre_hz)
 
     def process(self, ping: Ping) -> Structured:
         """Contact points of one measured ping, ULTRASONIC_POINT (n <= receivers,), rig frame."""
@@ -79,7 +97,7 @@ class UltrasonicPipeline:
 
     def rig_from_array(self, robot_pose: NDArray[np.float64]) -> NDArray[np.float64]:
         """4x4 pose of the array at a robot pose (x, y, z in mm; rx, ry, rz in rad)."""
-        return self.calibration.robot_pose @ robot_from_flange(robot_pose) @ self.calibration.array_pose
+        return self._robot_pose @ robot_from_flange(robot_pose) @ self._array_pose
 
     def compress(self, waveforms: Waveforms, sample_rate_hz: float) -> ComplexEnvelope:
         """Matched-filter output (receivers, UPSAMPLING * samples), 1 at an echo like the reference plate's."""
@@ -93,19 +111,40 @@ class UltrasonicPipeline:
         air_temperature_c: float,
         *,
         strongest: bool = False,
-        gate_mm: tuple[float, float] = (MIN_PATH_MM, MAX_PATH_MM),
+        gate_mm: tuple[float, float] | None = None,
     ) -> tuple[Arrivals, NDArray[np.float64]]:
         """Echo of each channel and its path length in mm (receivers,); not a number where there is none."""
-        bank = self._bank(waveforms.shape[1], sample_rate_hz)
-        compressed = bank.compress(waveforms)
-        rate_hz = sample_rate_hz * UPSAMPLING
+        gate = self._gate_mm if gate_mm is None else gate_mm
         speed = 1e3 * speed_of_sound_mps(self.calibration, air_temperature_c)  # mm/s
-        delay_s = float(self._delays_s.mean())
-        path_mm = np.maximum((np.arange(compressed.shape[1]) / rate_hz + start_s - delay_s) * speed, 1.0)
-        threshold = (self._surface * 2 * self.calibration.reference_mm / path_mm).astype(np.float32)
-        gate = (int(np.searchsorted(path_mm, gate_mm[0])), int(np.searchsorted(path_mm, gate_mm[1])))
-        found = first_arrivals(compressed, bank, rate_hz, gate, threshold, strongest=strongest)
-        return found, (found.time_s + start_s - self._delays_s) * speed
+        echoes, cut_s = self._baseband(waveforms, sample_rate_hz, start_s, speed, gate)
+        return self._arrivals(waveforms, echoes, cut_s, start_s, speed, gate, strongest)
+
+    def several_echoes(
+        self,
+        waveforms: Waveforms,
+        sample_rate_hz: float,
+        start_s: float,
+        air_temperature_c: float,
+        *,
+        gate_mm: tuple[float, float] | None = None,
+        most: int = 4,
+    ) -> list[tuple[Echoes, NDArray[np.float64]]]:
+        """Echoes of each channel, overlapping ones too, and their path lengths in mm (echoes,).
+
+        Runs the plain matched filter; see `several.several_echoes`.
+        """
+        gate = self._gate_mm if gate_mm is None else gate_mm
+        speed = 1e3 * speed_of_sound_mps(self.calibration, air_temperature_c)
+        echoes, cut_s = self._baseband(waveforms, sample_rate_hz, start_s, speed, gate, whitening=PLAIN)
+        offset_s = cut_s + start_s - float(self._delays_s.mean())
+        gate_s = gate[0] / speed - offset_s, gate[1] / speed - offset_s
+        level = np.ones(echoes.magnitude.shape[1], dtype=np.float32)
+        noise = first_arrivals(echoes, gate_s, level, floor=0.0, strongest=True).noise
+        out: list[tuple[Echoes, NDArray[np.float64]]] = []
+        for found, delay_s in zip(several_echoes(echoes, gate_s, noise, most=most), self._delays_s, strict=True):
+            time_s = found.time_s + cut_s
+            out.append((replace(found, time_s=time_s), (time_s + start_s - delay_s) * speed))
+        return out
 
     def strongest(self, ping: Ping, gate_mm: tuple[float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Arrival after the emission (delay included) and amplitude of the strongest echo in a gate, (receivers,).
@@ -142,8 +181,12 @@ class UltrasonicPipeline:
         """
         require_shape("waveforms", waveforms, (len(self._receivers_mm), None))
         speed = 1e3 * speed_of_sound_mps(self.calibration, air_temperature_c)
-        found, paths_mm = self.arrivals(waveforms, sample_rate_hz, start_s, air_temperature_c)
-        sigma_mm = np.hypot(PATH_FLOOR_MM, np.nan_to_num(found.sigma_s * speed))
+        echoes, cut_s = self._baseband(waveforms, sample_rate_hz, start_s, speed, self._gate_mm)
+        found, paths_mm = self._arrivals(waveforms, echoes, cut_s, start_s, speed, self._gate_mm, strongest=False)
+        if found.doubtful.any():
+            period_s = 1 / echoes.bank.centre_hz
+            found, paths_mm = settled(found, paths_mm, self._receivers_mm, period_s, speed, PATH_FLOOR_MM)
+        sigma_mm = np.hypot(PATH_FLOOR_MM, np.where(found.found, found.sigma_s * speed, 0.0))
         result = contact(self._receivers_mm, paths_mm, sigma_mm)
         pose = self.rig_from_array(robot_pose)
         used = np.flatnonzero(result.used)
@@ -156,30 +199,72 @@ class UltrasonicPipeline:
             out[name] = values
         out["sigma_mm"] = 0.5 * sigma_mm[used]
         out["path_mm"] = paths_mm[used]
-        out["energy"] = self._energy(waveforms, sample_rate_hz, start_s, speed)[used]
+        first_s, last_s = (length / speed - start_s - cut_s for length in self._gate_mm)
+        last_s += self._templates.shape[1] / sample_rate_hz
+        out["energy"] = (echoes.energy(first_s, last_s) / self._template_energy)[used]
         out["lobes"] = found.lobes[used]
         out["receiver"] = used
         out["kind"] = result.kind
         return out
 
-    def _bank(self, samples: int, sample_rate_hz: float) -> MatchedFilter:
+    def _baseband(
+        self,
+        waveforms: Waveforms,
+        sample_rate_hz: float,
+        start_s: float,
+        speed: float,
+        gate_mm: tuple[float, float],
+        whitening: float | None = None,
+    ) -> tuple[Baseband, float]:
+        """The part of the record that the gate needs after the matched filter, and when it begins in the record."""
+        margin = self._templates.shape[1]
+        edges_s = gate_mm[0] / speed - start_s, gate_mm[1] / speed + float(self._delays_s.max()) - start_s
+        first = min(max(0, int(edges_s[0] * sample_rate_hz) - margin), waveforms.shape[1])
+        last = max(first, min(waveforms.shape[1], int(edges_s[1] * sample_rate_hz) + 2 * margin))
+        bank = self._bank(last - first, sample_rate_hz, whitening)
+        return baseband(bank, waveforms[:, first:last]), first / sample_rate_hz
+
+    def _arrivals(
+        self,
+        waveforms: Waveforms,
+        echoes: Baseband,
+        cut_s: float,
+        start_s: float,
+        speed: float,
+        gate_mm: tuple[float, float],
+        strongest: bool,
+    ) -> tuple[Arrivals, NDArray[np.float64]]:
+        offset_s = cut_s + start_s - float(self._delays_s.mean())
+        path_mm = np.maximum((echoes.times_s + offset_s) * speed, 1.0)
+        threshold = (self._surface * 2 * self.calibration.reference_mm / path_mm).astype(np.float32)
+        gate_s = gate_mm[0] / speed - offset_s, gate_mm[1] / speed - offset_s
+        found = first_arrivals(echoes, gate_s, threshold, strongest=strongest)
+        time_s = found.time_s + cut_s
+        onset_s, onset_sigma_s = onsets(waveforms, self._edge, time_s, found.white_noise)
+        moved = replace(
+            found,
+            time_s=time_s,
+            envelope_s=found.envelope_s + cut_s,
+            onset_s=onset_s,
+            onset_sigma_s=onset_sigma_s,
+        )
+        return moved, (time_s + start_s - self._delays_s) * speed
+
+    def _bank(self, samples: int, sample_rate_hz: float, whitening: float | None = None) -> MatchedFilter:
         found = self.calibration
         if abs(sample_rate_hz - found.sample_rate_hz) > 1e-6 * found.sample_rate_hz:
             raise ValueError(
                 f"the array was calibrated at {found.sample_rate_hz} Hz, these echoes have {sample_rate_hz}"
             )
-        if samples not in self._banks:
-            self._banks[samples] = matched_filter(
+        key = padded_length(samples, self._templates.shape[1]), whitening
+        if key not in self._banks:
+            self._banks[key] = matched_filter(
                 self._templates,
                 found.template_origin,
                 sample_rate_hz,
                 (found.low_hz, found.high_hz),
                 samples,
                 upsampling=UPSAMPLING,
+                whitening=whitening,
             )
-        return self._banks[samples]
-
-    def _energy(self, waveforms: Waveforms, sample_rate_hz: float, start_s: float, speed: float) -> NDArray[np.float64]:
-        first = max(0, int((MIN_PATH_MM / speed - start_s) * sample_rate_hz))
-        passed = band_pass(waveforms[:, first:], sample_rate_hz, self.calibration.low_hz, self.calibration.high_hz)
-        return energy(paper_envelope(passed, sample_rate_hz), sample_rate_hz) / self._template_energy
+        return self._banks[key]

@@ -16,9 +16,16 @@ from echolume_messages.rig import ArraySettings
 from echolume_processing.ping import Ping
 from echolume_processing.ultrasonic.air import speed_of_sound_mps
 from echolume_processing.ultrasonic.block import BlockFit, fit_block
-from echolume_processing.ultrasonic.pipeline import UPSAMPLING, UltrasonicPipeline, waveforms_from_counts
+from echolume_processing.ultrasonic.pipeline import (
+    MAX_PATH_MM,
+    MIN_PATH_MM,
+    UPSAMPLING,
+    UltrasonicPipeline,
+    waveforms_from_counts,
+)
 from echolume_processing.ultrasonic.plate import Levels, PlateFit, fit_plate, plate_paths
 from echolume_processing.ultrasonic.templates import Templates, cut_templates, reference_pings
+from echolume_processing.ultrasonic.wiring import require_heights, require_wiring
 
 REFERENCE_MM = 150.0
 """Height of the perpendicular pings that become the templates, where the plan offers a choice."""
@@ -28,6 +35,7 @@ DIRECT_MM = 60.0
 """The direct sound arrives, electrical delay included, within this path."""
 MIN_DIRECT = 0.05
 MAX_RMS_MM = 0.3
+UPRIGHT = float(np.cos(np.radians(3.0)))
 MIN_PINGS = 6
 
 
@@ -119,6 +127,17 @@ def _direct_times(
     return np.where(clear, (peak + shift) / rate_hz, np.nan)
 
 
+def _require_heights(pings: Sequence[Ping], calibration: ArrayCalibration, nominal: Matrix) -> None:
+    """Paths of upright pings, wherever they are, against the heights that the robot says."""
+    upright = [p for p in pings if (robot_from_flange(p.robot_pose) @ nominal)[2, 2] < -UPRIGHT]
+    pipeline = UltrasonicPipeline(calibration)
+    times_s = np.array([pipeline.strongest(p, (MIN_PATH_MM, MAX_PATH_MM))[0] for p in upright])
+    known = np.isfinite(times_s).any(axis=1)
+    paths = np.full(len(upright), np.nan)
+    paths[known] = 1e3 * calibration.speed_of_sound_mps * np.nanmedian(times_s[known], axis=1)
+    require_heights(paths, np.array([p.robot_pose[2] for p in upright]))
+
+
 def calibrate_plate(pings: Sequence[Ping], settings: ArraySettings) -> ArrayResult:
     """Everything that pings at tilted poses over the plate z = 0 can tell; x, y and yaw of the robot stay nominal.
 
@@ -133,11 +152,14 @@ def calibrate_plate(pings: Sequence[Ping], settings: ArraySettings) -> ArrayResu
         )
     nominal = nominal_flange_from_array(settings)
     provisional, cut, paths = _provisional(pings, settings, nominal)
+    _require_heights(pings, provisional, nominal)
     times, levels = _echoes(pings, provisional, paths)
     direct = _direct_times(pings, cut.pings, provisional)
     poses = np.array([p.robot_pose for p in pings])
     temperatures = np.array([p.air_temperature_c for p in pings])
     emitter, receivers = np.array(provisional.emitter_mm), np.array(provisional.receivers_mm)
+    slopes = np.array([(robot_from_flange(p) @ nominal)[2, :2] for p in poses])
+    require_wiring(times * (1e3 * provisional.speed_of_sound_mps), slopes, receivers)
 
     def fitted(kept: NDArray[np.bool_]) -> PlateFit:
         part = replace(levels, amplitudes=levels.amplitudes[kept])
@@ -164,6 +186,7 @@ def calibrate_plate(pings: Sequence[Ping], settings: ArraySettings) -> ArrayResu
     array_pose = array_pose @ fit.flange_from_array
     calibration = msgspec.structs.replace(
         provisional,
+        receivers_mm=[(x, y, z) for x, y, z in fit.receivers_mm.tolist()],
         radius_mm=fit.radius_mm,
         delays_s=fit.delays_s.tolist(),
         reference_mm=float((array_pose[:3, :3] @ emitter + array_pose[:3, 3])[2]),

@@ -18,9 +18,13 @@ from echolume_processing.ultrasonic.plate_model import Levels, plate_paths
 from echolume_processing.ultrasonic.plate_problem import (
     CHANNEL_SIGMA_MM,
     COMMON_SIGMA_MM,
+    FIXED,
     NAMES,
     PLACEMENT_SIGMA_MM,
     POSE,
+    RADIUS,
+    RADIUS_SIGMA,
+    SPEED,
     PlateData,
     PlateProblem,
 )
@@ -126,9 +130,11 @@ def fit_plate(
     _require_determined(spread, len(poses))
     flange, rig = problem.transforms(found)
     speed, radius = problem.speed_mps(found), problem.radius_mm(found)
-    placed = problem.basis @ covariance[11 : problem.priors, 11 : problem.priors] @ problem.basis.T
+    placed = problem.basis @ covariance[FIXED : problem.priors, FIXED : problem.priors] @ problem.basis.T
     receivers_sigma = np.sqrt(np.diag(placed)).reshape(-1, 3)
-    delays_s = found[problem.priors : -1] / (1e3 * speed)
+    loose = _loose_axes(receivers_sigma)
+    nominal = np.array([axis in loose for axis in "xyz"])
+    delays_s, delay_covariance = _delays(problem, found, covariance, nominal)
     level = problem.level_left(found)
     scale = problem.sigmas[:POSE]
     return PlateFit(
@@ -137,12 +143,12 @@ def fit_plate(
         speed_mps=speed,
         temperature_c=problem.temperature_c,
         delays_s=delays_s,
-        delay_covariance_s2=_delay_covariance(problem, covariance, delays_s, speed),
-        receivers_mm=problem.receivers_mm(found),
+        delay_covariance_s2=delay_covariance,
+        receivers_mm=np.where(nominal, receivers_mm, problem.receivers_mm(found)),
         receivers_sigma_mm=receivers_sigma,
-        receivers_undetermined=_loose_axes(receivers_sigma),
+        receivers_undetermined=loose,
         radius_mm=radius,
-        radius_sigma_mm=radius * 0.05 * float(spread[10]),
+        radius_sigma_mm=problem.radius_mm(np.zeros(problem.size)) * RADIUS_SIGMA * float(spread[RADIUS]),
         path_rms_mm=rms,
         level_rms=float(np.sqrt(np.mean(level**2))) if level.size else 0.0,
         sigmas=dict(zip(NAMES, (spread[:10] * problem.sigmas).tolist(), strict=True)),
@@ -197,15 +203,18 @@ def _loose_axes(receivers_sigma_mm: Points3) -> tuple[str, ...]:
     return tuple(axis for axis, s in zip("xyz", share.tolist(), strict=True) if s > DETERMINED)
 
 
-def _delay_covariance(
-    problem: PlateProblem, covariance: NDArray[np.float64], delays_s: NDArray[np.float64], speed_mps: float
-) -> NDArray[np.float64]:
-    """A delay is fitted as a path; in seconds it takes the error of the speed along."""
-    n = problem.receivers
+def _delays(
+    problem: PlateProblem, found: NDArray[np.float64], covariance: NDArray[np.float64], nominal: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Delays in s and their covariance, with what the receivers' places add along the axes that stay nominal."""
+    n, speed = problem.receivers, 1e3 * problem.speed_mps(found)
     slopes = np.zeros((n, problem.size))
-    slopes[:, problem.priors : -1] = np.eye(n) / (1e3 * speed_mps)
-    slopes[:, 9] = -delays_s * problem.sigmas[9] / speed_mps
-    return slopes @ covariance @ slopes.T
+    slopes[:, problem.priors : -1] = np.eye(n)
+    ways = problem.basis.reshape(n, 3, -1) * nominal[:, None]
+    slopes[:, FIXED : problem.priors] = np.einsum("ri,rik->rk", problem.delay_by_place(found), ways)
+    delays_s = slopes @ found / speed
+    slopes[:, SPEED] = -delays_s * 1e3 * problem.sigmas[SPEED]
+    return delays_s, slopes @ covariance @ slopes.T / speed**2
 
 
 def _left_out(

@@ -57,15 +57,24 @@ def plate_levels(
     return out / path
 
 
-def near_field_mm(paths_mm: NDArray[np.float64], radius_mm: float, reference_mm: float) -> NDArray[np.float64]:
+def near_field_mm(
+    paths_mm: NDArray[np.float64], radius_mm: float, reference_mm: float, tilted: NDArray[np.float64] | float = 0.0
+) -> NDArray[np.float64]:
     """How much later than over the plate at `reference_mm` of path the echo of disks comes than that of points.
+
+    Parameters
+    ----------
+    paths_mm : (pings, receivers) float64
+    radius_mm, reference_mm : float
+    tilted : (pings, 1) float64
+        What tilt adds, as a share of what an upright array has.
 
     Notes
     -----
     The mean way between two disks of radius R that face each other over a path L is L + R^2 / (2 L), for R much
     smaller than L: 0.06 mm at 300 mm. At the reference it belongs to the channels' delays, as in the templates.
     """
-    return 0.5 * radius_mm**2 * (1 / paths_mm - 1 / reference_mm)
+    return 0.5 * radius_mm**2 * ((1 + tilted) / paths_mm - 1 / reference_mm)
 
 
 def path_slopes(

@@ -40,8 +40,13 @@ NAMES = (
     "rig_from_robot ry",
     "speed of sound",
 )
-POSE, SPEED, RADIUS, FIXED = 9, 9, 10, 11
-"""Numbers of the pose's unknowns, places of speed and radius, and where the receivers' unknowns begin."""
+POSE, SPEED, RADIUS, LATENESS, FIXED = 9, 9, 10, 11, 12
+"""Number of the pose's unknowns, places of speed, radius and lateness, and where the receivers' unknowns begin."""
+LATENESS_SIGMA = 5.0
+"""A disk that is tilted by t sends its echo later than an upright one, by an unknown number of times sin^2 t of its near
+field's lateness: far-field beams do not tell how many times."""
+UPRIGHT = 0.01
+"""Square of the sine of the tilt up to which a ping counts as upright."""
 STEP = 1e-4
 """Of a prior's sigma, for differences."""
 
@@ -95,6 +100,8 @@ class PlateProblem:
         self._warmth = np.sqrt((data.temperatures_c + ZERO_CELSIUS_K) / (self.temperature_c + ZERO_CELSIUS_K))[:, None]
         self._robot = np.array([robot_from_flange(p) for p in data.poses])
         self.known = np.isfinite(data.times_s)
+        upright = (self._robot @ nominal_flange_from_array)[:, 2, 2]
+        self._tilt_squared = (1 - upright**2)[:, None]
         self._times_s = np.nan_to_num(data.times_s)
         self.sigmas = np.array(
             [MOUNTING_SIGMA_MM] * 3
@@ -151,9 +158,18 @@ class PlateProblem:
     def paths_left_mm(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
         """Measured minus modelled path, (pings, receivers); 0 where none was measured."""
         paths = self._paths(at)
-        paths = paths + near_field_mm(paths, self.radius_mm(at), self._reference_mm)
+        paths = paths + near_field_mm(
+            paths, self.radius_mm(at), self._reference_mm, LATENESS_SIGMA * at[LATENESS] * self._tilt_squared
+        )
         measured = self._times_s * (1e3 * self.speed_mps(at)) * self._warmth
         return np.where(self.known, measured - at[self.priors : -1] - paths, 0.0)
+
+    def delay_by_place(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What a receiver's place adds to its path over the plate, mm per mm, mean of the most upright pings,
+        (receivers, 3): as much goes to the channel's delay where the place stays nominal."""
+        slopes = path_slopes(self.rig_from_array(at), self._emitter_mm, self.receivers_mm(at))
+        tilt = self._tilt_squared.ravel()
+        return slopes[tilt <= tilt.min() + UPRIGHT].mean(axis=0)
 
     def level_left(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
         """Logarithm of measured over modelled amplitude, (loud pings,)."""

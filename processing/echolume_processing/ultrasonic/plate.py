@@ -28,6 +28,7 @@ from echolume_processing.ultrasonic.plate_problem import (
     PlateData,
     PlateProblem,
 )
+from echolume_processing.ultrasonic.suspicion import Suspicion, strongest_suspicion
 
 __all__ = ["Levels", "PlateFit", "fit_plate", "plate_paths"]
 
@@ -36,8 +37,19 @@ SLIP_MM = 1.0
 SLIP_ROUNDS = 4
 DETERMINED = 0.5
 """A parameter whose sigma the data did not bring below this share of its mounting sigma is undetermined."""
-FREE = {"flange_from_array z", "rig_from_robot z"}
-"""Heights trade against the channels' common delay; only their sum enters a measurement, and that is determined."""
+LIMITS = {
+    "flange_from_array x": 0.3,
+    "flange_from_array y": 0.3,
+    "flange_from_array rx": float(np.radians(0.3)),
+    "flange_from_array ry": float(np.radians(0.3)),
+    "flange_from_array yaw": float(np.radians(0.3)),
+    "rig_from_robot rx": float(np.radians(0.1)),
+    "rig_from_robot ry": float(np.radians(0.1)),
+    "speed of sound": 0.5,
+}
+"""mm, rad and m/s: what a scan can do with. A parameter with a larger sigma is undetermined, too. The heights are not
+among them: they trade against the channels' common delay; only their sum enters a measurement, and that is determined."""
+MAX_SUSPICION_MM = 0.15
 EXPECTED_MM = float(np.hypot(CHANNEL_SIGMA_MM, COMMON_SIGMA_MM))
 
 
@@ -69,6 +81,8 @@ class PlateFit:
     """(9, 9) of the first nine `plate_problem.NAMES`, mm and rad."""
     residuals_mm: NDArray[np.float64]
     """Measured minus modelled path, (pings, receivers)."""
+    suspicion: Suspicion | None
+    """A small unevenness of the bench or shift of the robot that the paths speak for, too small to refuse them."""
     left_out: NDArray[np.float64]
     """How well all others predict each ping: chi-squared per path, (pings,); 1 is as well as the sigmas say."""
 
@@ -117,17 +131,19 @@ def fit_plate(
     require_shape("times_s", times_s, (len(poses), n))
     direct = np.full(n, np.nan) if direct_s is None else direct_s
     data = PlateData(poses, times_s, temperatures_c, direct, levels)
-    problem, found = _solved(data, emitter_mm, receivers_mm, nominal_flange_from_array)
-    left = np.where(problem.known, problem.paths_left_mm(found), np.nan)
-    rms = float(np.sqrt(np.nanmean(left**2)))
-    worse = max(1.0, rms / EXPECTED_MM)
-    slopes = problem.jacobian(found)
-    measured = slopes[: -problem.priors] / worse
-    prior = np.zeros(problem.size)
-    prior[: problem.priors] = 1.0
-    covariance = np.linalg.inv(measured.T @ measured + np.diag(prior))
+    whole = PlateProblem(data, emitter_mm, receivers_mm, nominal_flange_from_array)
+    problem, found = _solved(whole)
+    suspicion = strongest_suspicion(whole, found, _covariance(whole, found, 1.0))
+    if suspicion is not None and suspicion.amount_mm > MAX_SUSPICION_MM:
+        raise CalibrationRejectedError(
+            f"array calibration: paths over the plate contradict each other, as if {suspicion.words}; set the rig up "
+            "again and repeat all passes"
+        )
+    worse = max(1.0, float(np.sqrt(np.mean(problem.paths_left_mm(found)[problem.known] ** 2))) / EXPECTED_MM)
+    covariance = _covariance(problem, found, worse)
     spread = np.sqrt(np.diag(covariance))
-    _require_determined(spread, len(poses))
+    _require_determined(spread, problem.sigmas, len(poses))
+    left = np.where(problem.known, problem.paths_left_mm(found), np.nan)
     flange, rig = problem.transforms(found)
     speed, radius = problem.speed_mps(found), problem.radius_mm(found)
     placed = problem.basis @ covariance[FIXED : problem.priors, FIXED : problem.priors] @ problem.basis.T
@@ -149,20 +165,18 @@ def fit_plate(
         receivers_undetermined=loose,
         radius_mm=radius,
         radius_sigma_mm=problem.radius_mm(np.zeros(problem.size)) * RADIUS_SIGMA * float(spread[RADIUS]),
-        path_rms_mm=rms,
+        path_rms_mm=float(np.sqrt(np.nanmean(left**2))),
         level_rms=float(np.sqrt(np.mean(level**2))) if level.size else 0.0,
         sigmas=dict(zip(NAMES, (spread[:10] * problem.sigmas).tolist(), strict=True)),
         pose_covariance=covariance[:POSE, :POSE] * np.outer(scale, scale),
         residuals_mm=left,
-        left_out=_left_out(problem, found, slopes, covariance, worse),
+        suspicion=suspicion,
+        left_out=_left_out(problem, found, covariance, worse),
     )
 
 
-def _solved(
-    data: PlateData, emitter_mm: NDArray[np.float64], receivers_mm: Points3, nominal: Matrix
-) -> tuple[PlateProblem, NDArray[np.float64]]:
+def _solved(problem: PlateProblem) -> tuple[PlateProblem, NDArray[np.float64]]:
     """The problem less the paths that slipped, and its solution."""
-    problem = PlateProblem(data, emitter_mm, receivers_mm, nominal)
     found = problem.start()
     for _ in range(SLIP_ROUNDS):
         solved = least_squares(
@@ -174,13 +188,21 @@ def _solved(
         slipped = problem.known & ((np.abs(left - middle) > SLIP_MM) | (np.abs(left) > 2 * SLIP_MM))
         if not slipped.any():
             break
-        problem = PlateProblem(problem.data.without(slipped), emitter_mm, receivers_mm, nominal)
-        if not problem.known.any(axis=0).all():
+        if not (problem.known & ~slipped).any(axis=0).all():
             raise CalibrationRejectedError(
                 f"array calibration: paths over the plate contradict each other by {float(np.abs(left).max()):.1f} mm; "
                 "is the bench bare and flat, and the nominal mounting of the array right?"
             )
+        problem = problem.without(slipped)
     return problem, found
+
+
+def _covariance(problem: PlateProblem, found: NDArray[np.float64], worse: float) -> NDArray[np.float64]:
+    """Covariance of the unknowns in the problem's units, where the paths scatter `worse` times their sigma."""
+    measured = problem.jacobian(found)[: -problem.priors] / worse
+    prior = np.zeros(problem.size)
+    prior[: problem.priors] = 1.0
+    return np.linalg.inv(measured.T @ measured + np.diag(prior))
 
 
 def _row_medians(values: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -188,8 +210,12 @@ def _row_medians(values: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArr
     return np.array([[float(np.median(row[k])) if k.any() else 0.0] for row, k in zip(values, known, strict=True)])
 
 
-def _require_determined(spread: NDArray[np.float64], pings: int) -> None:
-    loose = [n for n, s in zip(NAMES, spread[:10], strict=True) if s > DETERMINED and n not in FREE]
+def _require_determined(spread: NDArray[np.float64], sigmas: NDArray[np.float64], pings: int) -> None:
+    loose = [
+        name
+        for name, share, sigma in zip(NAMES, spread[:10].tolist(), (spread[:10] * sigmas).tolist(), strict=True)
+        if name in LIMITS and (share > DETERMINED or sigma > LIMITS[name])
+    ]
     if loose:
         raise CalibrationRejectedError(
             f"array calibration: {pings} pings over the plate leave undetermined: {', '.join(loose)}; "
@@ -220,7 +246,6 @@ def _delays(
 def _left_out(
     problem: PlateProblem,
     found: NDArray[np.float64],
-    slopes: NDArray[np.float64],
     covariance: NDArray[np.float64],
     worse: float,
 ) -> NDArray[np.float64]:
@@ -232,6 +257,7 @@ def _left_out(
     (1 - H)^-1 e with the covariance (1 - H)^-1.
     """
     n = problem.receivers
+    slopes = problem.jacobian(found)
     residuals = problem.residuals(found) / worse
     out = np.full(len(problem.known), np.nan)
     for k, known in enumerate(problem.known):

@@ -76,10 +76,6 @@ class PlateData:
     direct_s: NDArray[np.float64]  # (receivers,), not a number where unknown
     levels: Levels | None
 
-    def without(self, slipped: NDArray[np.bool_]) -> PlateData:
-        """Less some paths, (pings, receivers)."""
-        return replace(self, times_s=np.where(slipped, np.nan, self.times_s))
-
 
 class PlateProblem:
     """Residuals and their slopes over one vector of unknowns: each in units of its prior sigma, then the delays in mm and
@@ -119,6 +115,11 @@ class PlateProblem:
         self._heights = means[self.loud]
         self._radius_mm = 0.0 if levels is None else levels.radius_mm
         self._reference_mm = float(np.median(self._paths(np.zeros(self.size))))
+
+    def without(self, slipped: NDArray[np.bool_]) -> PlateProblem:
+        """The same less some paths, (pings, receivers)."""
+        kept = replace(self.data, times_s=np.where(slipped, np.nan, self.data.times_s))
+        return PlateProblem(kept, self._emitter_mm, self._nominal_mm, self._nominal_flange)
 
     def start(self) -> NDArray[np.float64]:
         """Nominal mounting, and the delays and the level that suit it."""
@@ -200,6 +201,11 @@ class PlateProblem:
         """Paths, levels, direct sound and priors, each in its sigma."""
         paths = np.einsum("prs,ps->pr", self._whiten, self.paths_left_mm(at)).ravel()
         return np.concatenate([paths, self.level_left(at) / LEVEL_SIGMA, self._common(at), at[: self.priors]])
+
+    def shared(self, pattern: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Rows of the paths when each ping's paths all grow by a pattern (pings, shapes) in mm."""
+        by_ping = np.einsum("prs,ps->pr", self._whiten, self.known.astype(np.float64))
+        return (by_ping[:, :, None] * pattern[:, None, :]).reshape(self.known.size, -1)
 
     def jacobian(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
         """Slopes of `residuals` (rows, unknowns): differences for the poses, closed form for receivers and delays."""

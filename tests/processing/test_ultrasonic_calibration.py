@@ -55,7 +55,7 @@ def result(truth: ArrayTruth) -> calibrate.ArrayResult:
     block = SCENES["block"]()
     return calibrate.calibrate_array(
         take(SCENES["plate"](), plate_poses(), truth, SETTINGS, 1),
-        take(block, block_poses(pitch_mm=16.0), truth, SETTINGS, 2),
+        take(block, block_poses(), truth, SETTINGS, 2),
         seen_by_light(block),
         SETTINGS,
     )

@@ -50,6 +50,11 @@ LIMITS = {
 """mm, rad and m/s: what a scan can do with. A parameter with a larger sigma is undetermined, too. The heights are not
 among them: they trade against the channels' common delay; only their sum enters a measurement, and that is determined."""
 MAX_SUSPICION_MM = 0.15
+SURE = 0.25
+"""A cause that explains this share of all chi-squared is believed; a few slipped paths are nobody's fault."""
+MAX_RMS_MM = 0.2
+MAX_SLIPS = 0.2
+"""Share of the paths."""
 EXPECTED_MM = float(np.hypot(CHANNEL_SIGMA_MM, COMMON_SIGMA_MM))
 
 
@@ -134,12 +139,10 @@ def fit_plate(
     whole = PlateProblem(data, emitter_mm, receivers_mm, nominal_flange_from_array)
     problem, found = _solved(whole)
     suspicion = strongest_suspicion(whole, found, _covariance(whole, found, 1.0))
-    if suspicion is not None and suspicion.amount_mm > MAX_SUSPICION_MM:
-        raise CalibrationRejectedError(
-            f"array calibration: paths over the plate contradict each other, as if {suspicion.words}; set the rig up "
-            "again and repeat all passes"
-        )
-    worse = max(1.0, float(np.sqrt(np.mean(problem.paths_left_mm(found)[problem.known] ** 2))) / EXPECTED_MM)
+    rms = float(np.sqrt(np.mean(problem.paths_left_mm(found)[problem.known] ** 2)))
+    slips = 1 - np.count_nonzero(problem.known) / max(1, np.count_nonzero(whole.known))
+    _require_consistent(suspicion, rms, slips)
+    worse = max(1.0, rms / EXPECTED_MM)
     covariance = _covariance(problem, found, worse)
     spread = np.sqrt(np.diag(covariance))
     _require_determined(spread, problem.sigmas, len(poses))
@@ -165,7 +168,7 @@ def fit_plate(
         receivers_undetermined=loose,
         radius_mm=radius,
         radius_sigma_mm=problem.radius_mm(np.zeros(problem.size)) * RADIUS_SIGMA * float(spread[RADIUS]),
-        path_rms_mm=float(np.sqrt(np.nanmean(left**2))),
+        path_rms_mm=rms,
         level_rms=float(np.sqrt(np.mean(level**2))) if level.size else 0.0,
         sigmas=dict(zip(NAMES, (spread[:10] * problem.sigmas).tolist(), strict=True)),
         pose_covariance=covariance[:POSE, :POSE] * np.outer(scale, scale),
@@ -208,6 +211,20 @@ def _covariance(problem: PlateProblem, found: NDArray[np.float64], worse: float)
 def _row_medians(values: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Median of what is known in each row, 0 where nothing is, (rows, 1)."""
     return np.array([[float(np.median(row[k])) if k.any() else 0.0] for row, k in zip(values, known, strict=True)])
+
+
+def _require_consistent(suspicion: Suspicion | None, rms_mm: float, slips: float) -> None:
+    """Refuse paths that contradict each other, with the likeliest cause."""
+    bad = rms_mm > MAX_RMS_MM or slips > MAX_SLIPS
+    sure = suspicion is not None and suspicion.share > SURE and suspicion.amount_mm > MAX_SUSPICION_MM
+    if not bad and not sure:
+        return
+    scatter = f"they scatter by {rms_mm:.2f} mm rms, {slips:.0%} of them slipped"
+    cause = f"as if {suspicion.words}" if suspicion is not None else "without one cause for all"
+    raise CalibrationRejectedError(
+        f"array calibration: paths over the plate contradict each other, {cause}; {scatter}; is the bench bare and flat, "
+        "and the rig untouched since the first ping? Repeat all passes"
+    )
 
 
 def _require_determined(spread: NDArray[np.float64], sigmas: NDArray[np.float64], pings: int) -> None:

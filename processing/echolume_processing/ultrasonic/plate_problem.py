@@ -199,8 +199,11 @@ class PlateProblem:
 
     def residuals(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
         """Paths, levels, direct sound and priors, each in its sigma."""
-        paths = np.einsum("prs,ps->pr", self._whiten, self.paths_left_mm(at)).ravel()
-        return np.concatenate([paths, self.level_left(at) / LEVEL_SIGMA, self._common(at), at[: self.priors]])
+        return np.concatenate([self.whitened(self.paths_left_mm(at)), self.level_left(at) / LEVEL_SIGMA, self._common(at), at[: self.priors]])
+
+    def whitened(self, paths_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Rows of the paths (pings, receivers), in their sigma."""
+        return np.einsum("prs,ps->pr", self._whiten, np.where(self.known, paths_mm, 0.0)).ravel()
 
     def shared(self, pattern: NDArray[np.float64]) -> NDArray[np.float64]:
         """Rows of the paths when each ping's paths all grow by a pattern (pings, shapes) in mm."""

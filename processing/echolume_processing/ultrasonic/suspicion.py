@@ -12,11 +12,11 @@ from echolume_processing.ultrasonic.plate_problem import PlateProblem
 
 MIN_GAIN = 60.0
 """A suspicion explains at least this much of chi-squared: some eight sigma."""
-MIN_SHARE = 0.25
-"""And at least this much of all that is unexplained: a few slipped paths are nobody's fault."""
 MIN_SIDE = 3
 """Pings on each side of a step."""
-MIN_APART_MM = 20.0
+MIN_APART_MM = 5.0
+WEAK = 1e8
+"""Condition of what is left of a pattern beside the unknowns: a worse one is explained by them."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,8 @@ class Suspicion:
     """Of height."""
     gain: float
     """By how much chi-squared falls with it."""
+    share: float
+    """Of all chi-squared."""
 
 
 def strongest_suspicion(
@@ -51,19 +53,19 @@ def strongest_suspicion(
     rows = problem.known.size
     slopes = problem.jacobian(found)[:rows]
     left = problem.residuals(found)[:rows]
-    least = max(MIN_GAIN, MIN_SHARE * float(left @ left))
+    whole = max(float(left @ left), 1e-12)
     best: Suspicion | None = None
     for words, pattern in _patterns(problem.data.poses):
         shift = problem.shared(pattern)
         clean = shift - slopes @ (covariance @ (slopes.T @ shift))
         curvature = clean.T @ shift
-        if np.linalg.cond(curvature) > 1e8:
+        if np.linalg.cond(curvature) > WEAK:
             continue
         amounts = np.linalg.solve(curvature, clean.T @ left)
         gain = float(amounts @ (clean.T @ left))
-        if gain > least and (best is None or gain > best.gain):
+        if gain > MIN_GAIN and (best is None or gain > best.gain):
             height_mm = 0.5 * float(np.ptp(pattern @ amounts))
-            best = Suspicion(f"{words} (about {height_mm:.2f} mm)", height_mm, gain)
+            best = Suspicion(f"{words} (about {height_mm:.2f} mm)", height_mm, gain, gain / whole)
     return best
 
 

@@ -79,6 +79,7 @@ def reasons(fit: PlateFit, footprint: Footprint | None) -> list[str]:
         f"{float(np.sqrt(known.max())):.2f}"
     ]
     placed_mm = float(np.sqrt(np.mean(fit.receivers_sigma_mm[:, :2] ** 2)))
+    out.extend(f"not told apart: {words}" for words in fit.undetermined)
     if fit.receivers_undetermined:
         axes = ", ".join(fit.receivers_undetermined)
         out.append(f"receivers: {axes} not determined by these poses, kept as drawn")

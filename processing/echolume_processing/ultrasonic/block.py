@@ -161,11 +161,11 @@ def fit_block(
     independent = PULSE * max(1.0, float(np.mean(left**2)))
     prior = np.diag(np.array(SCALES) ** -2)
     information = slopes.T @ slopes / independent + prior
-    covariance = np.linalg.inv(information[:3, :3])
+    covariance = np.asarray(np.linalg.inv(information[:3, :3]), dtype=np.float64)
     sigmas = np.sqrt(np.diag(covariance))
     limits = (LIMIT_MM, LIMIT_MM, LIMIT_RAD)
     loose = [n for n, s, limit in zip(NAMES, sigmas, limits, strict=True) if s > limit]
-    change = np.linalg.solve(information, -slopes.T @ left / independent)[3:]
+    change = np.asarray(np.linalg.solve(information, -slopes.T @ left / independent), dtype=np.float64)[3:]
     if abs(lag_mm) > LAG_MM and explained < 1 - MIN_EXPLAINED:
         raise CalibrationRejectedError(
             f"array calibration: over the block echoes come {lag_mm:.1f} mm of path later than the plate's calibration "

@@ -243,8 +243,8 @@ def calibrate_array(
     Raises
     ------
     CalibrationRejectedError
-        With the reason in plain words: what stays undetermined (and the poses that would determine it), what is wired or
-        counted the wrong way round, or what was moved.
+        With the reason in plain words: what stays undetermined (and the poses that would determine it), what is wired
+        or counted the wrong way round, or what was moved.
     """
     plate = calibrate_plate(pings_plate, settings)
     block = fit_block(pings_block, optical_block_points_mm, plate.calibration)

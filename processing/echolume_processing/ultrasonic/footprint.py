@@ -1,7 +1,7 @@
 """How wide the array sees: the footprint from the echo's fall over the block's edges, beside what physics expects.
 
-Over a flat target the echo comes from the first Fresnel zone, whose radius is sqrt(wavelength height / 2). Where part of
-the target is missing, the rest of the zones adds up to the Fresnel integral over what is there; its scale is fitted.
+Over a flat target the echo comes from the first Fresnel zone, whose radius is sqrt(wavelength height / 2). Where part
+of the target is missing, the zones that are left add up to the Fresnel integral over them; its scale is fitted.
 """
 
 from __future__ import annotations
@@ -161,9 +161,7 @@ def edge_response(
     return np.abs(out)
 
 
-def fit_footprint(
-    pings: Sequence[Ping], optical_points_mm: Points3, calibration: ArrayCalibration
-) -> Footprint:
+def fit_footprint(pings: Sequence[Ping], optical_points_mm: Points3, calibration: ArrayCalibration) -> Footprint:
     """Footprint from a raster over the block's edges.
 
     Parameters

@@ -30,7 +30,7 @@ def poses_to_add(undetermined: Sequence[str]) -> list[str]:
 
 
 def loose_directions(
-    information: NDArray[np.float64], names: Sequence[str], least: float
+    information: NDArray[np.float64], names: Sequence[str], threshold: float
 ) -> list[tuple[float, str]]:
     """Directions in which an information matrix falls short, weakest first.
 
@@ -39,24 +39,24 @@ def loose_directions(
     information : (n, n) float64
         In units in which 1 is wanted of each parameter: scale rows and columns by the sigma that would be good enough.
     names : n words
-    least : float
+    threshold : float
         Eigenvalues below this are undetermined.
 
     Returns
     -------
-    List of (eigenvalue, words): one parameter by its name, a mixture as ``a together with b``, or ``a against b`` where
-    only their sum is known.
+    List of (eigenvalue, words): one parameter by its name, or a mixture: ``a together with b`` where both may grow
+    unseen, ``a against b`` where one may grow as the other shrinks.
     """
     n = len(names)
     require_shape("information", information, (n, n))
     values, vectors = np.linalg.eigh(information)
-    return [(float(v), _words(vectors[:, k], names)) for k, v in enumerate(values.tolist()) if v < least]
+    return [(float(v), _words(vectors[:, k], names)) for k, v in enumerate(values.tolist()) if v < threshold]
 
 
 def _words(direction: NDArray[np.float64], names: Sequence[str]) -> str:
-    order = [k for k in np.argsort(-np.abs(direction)).tolist() if abs(direction[k]) > IN_COMMON]
+    order = [int(k) for k in np.argsort(-np.abs(direction)) if abs(direction[k]) > IN_COMMON]
     first = order[0]
-    same = [names[k] for k in order[1:] if direction[k] * direction[first] > 0]
-    other = [names[k] for k in order[1:] if direction[k] * direction[first] < 0]
+    same = [str(names[k]) for k in order[1:] if direction[k] * direction[first] > 0]
+    other = [str(names[k]) for k in order[1:] if direction[k] * direction[first] < 0]
     words = " together with ".join([names[first], *same])
     return words + (f" against {' and '.join(other)}" if other else "")

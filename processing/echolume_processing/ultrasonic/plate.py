@@ -6,6 +6,7 @@ All unknowns are fitted at once to all paths (`plate_problem`).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,8 @@ from scipy.optimize import least_squares
 
 from echolume_messages.errors import CalibrationRejectedError
 from echolume_messages.geometry import Matrix, Points3, require_shape
-from echolume_processing.ultrasonic.observability import MISSING_POSES, poses_to_add
+from echolume_processing.ultrasonic.leave_out import left_out
+from echolume_processing.ultrasonic.observability import MISSING_POSES, loose_directions, poses_to_add
 from echolume_processing.ultrasonic.plate_model import Levels, plate_paths
 from echolume_processing.ultrasonic.plate_problem import (
     CHANNEL_SIGMA_MM,
@@ -48,7 +50,7 @@ LIMITS = {
     "speed of sound": 0.5,
 }
 """mm, rad and m/s: what a scan can do with. A parameter with a larger sigma is undetermined, too. The heights are not
-among them: they trade against the channels' common delay; only their sum enters a measurement, and that is determined."""
+among them: they trade against each other and the channels' common delay, and only their sum enters a measurement."""
 MAX_SUSPICION_MM = 0.15
 SURE = 0.25
 """A cause that explains this share of all chi-squared is believed; a few slipped paths are nobody's fault."""
@@ -73,7 +75,7 @@ class PlateFit:
     receivers_mm: Points3
     receivers_sigma_mm: Points3
     receivers_undetermined: tuple[str, ...]
-    """Axes along which the pings hardly tell where the receivers sit: there they stay nominal within the mounting sigma."""
+    """Axes along which the pings hardly tell where the receivers sit: there they stay nominal, with that sigma."""
     radius_mm: float
     """Effective radius of the transducers, from how the echo weakens with tilt."""
     radius_sigma_mm: float
@@ -86,6 +88,8 @@ class PlateFit:
     """(9, 9) of the first nine `plate_problem.NAMES`, mm and rad."""
     residuals_mm: NDArray[np.float64]
     """Measured minus modelled path, (pings, receivers)."""
+    undetermined: tuple[str, ...]
+    """Directions of the unknowns that stay as uncertain as the mounting, in words."""
     suspicion: Suspicion | None
     """A small unevenness of the bench or shift of the robot that the paths speak for, too small to refuse them."""
     left_out: NDArray[np.float64]
@@ -173,8 +177,9 @@ def fit_plate(
         sigmas=dict(zip(NAMES, (spread[:10] * problem.sigmas).tolist(), strict=True)),
         pose_covariance=covariance[:POSE, :POSE] * np.outer(scale, scale),
         residuals_mm=left,
+        undetermined=_loose_directions(covariance),
         suspicion=suspicion,
-        left_out=_left_out(problem, found, covariance, worse),
+        left_out=left_out(problem, found, covariance, worse),
     )
 
 
@@ -183,7 +188,13 @@ def _solved(problem: PlateProblem) -> tuple[PlateProblem, NDArray[np.float64]]:
     found = problem.start()
     for _ in range(SLIP_ROUNDS):
         solved = least_squares(
-            problem.residuals, found, jac=problem.jacobian, loss="soft_l1", f_scale=3.0, x_scale="jac", max_nfev=60
+            problem.residuals,
+            found,
+            jac=cast("str", problem.jacobian),  # scipy's stubs know the names of its own ways only
+            loss="soft_l1",
+            f_scale=3.0,
+            x_scale="jac",
+            max_nfev=60,
         )
         found = np.asarray(solved.x, dtype=np.float64)
         left = problem.paths_left_mm(found)
@@ -205,7 +216,7 @@ def _covariance(problem: PlateProblem, found: NDArray[np.float64], worse: float)
     measured = problem.jacobian(found)[: -problem.priors] / worse
     prior = np.zeros(problem.size)
     prior[: problem.priors] = 1.0
-    return np.linalg.inv(measured.T @ measured + np.diag(prior))
+    return np.asarray(np.linalg.inv(measured.T @ measured + np.diag(prior)), dtype=np.float64)
 
 
 def _row_medians(values: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -222,8 +233,8 @@ def _require_consistent(suspicion: Suspicion | None, rms_mm: float, slips: float
     scatter = f"they scatter by {rms_mm:.2f} mm rms, {slips:.0%} of them slipped"
     cause = f"as if {suspicion.words}" if suspicion is not None else "without one cause for all"
     raise CalibrationRejectedError(
-        f"array calibration: paths over the plate contradict each other, {cause}; {scatter}; is the bench bare and flat, "
-        "and the rig untouched since the first ping? Repeat all passes"
+        f"array calibration: paths over the plate contradict each other, {cause}; {scatter}; is the bench bare and "
+        "flat, and the rig untouched since the first ping? Repeat all passes"
     )
 
 
@@ -238,6 +249,12 @@ def _require_determined(spread: NDArray[np.float64], sigmas: NDArray[np.float64]
             f"array calibration: {pings} pings over the plate leave undetermined: {', '.join(loose)}; "
             f"add poses: {'; '.join(poses_to_add(loose)) or MISSING_POSES}"
         )
+
+
+def _loose_directions(covariance: NDArray[np.float64]) -> tuple[str, ...]:
+    number = len(NAMES)
+    information = np.asarray(np.linalg.inv(covariance[:number, :number]), dtype=np.float64)
+    return tuple(words for _, words in loose_directions(information, NAMES, DETERMINED**-2))
 
 
 def _loose_axes(receivers_sigma_mm: Points3) -> tuple[str, ...]:
@@ -258,30 +275,3 @@ def _delays(
     delays_s = slopes @ found / speed
     slopes[:, SPEED] = -delays_s * 1e3 * problem.sigmas[SPEED]
     return delays_s, slopes @ covariance @ slopes.T / speed**2
-
-
-def _left_out(
-    problem: PlateProblem,
-    found: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-    worse: float,
-) -> NDArray[np.float64]:
-    """Chi-squared per path of each ping as the fit without it predicts it, (pings,).
-
-    Notes
-    -----
-    With e the ping's residuals in their sigma and H = J C J' its block of the hat matrix, the fit without it leaves
-    (1 - H)^-1 e with the covariance (1 - H)^-1.
-    """
-    n = problem.receivers
-    slopes = problem.jacobian(found)
-    residuals = problem.residuals(found) / worse
-    out = np.full(len(problem.known), np.nan)
-    for k, known in enumerate(problem.known):
-        if not known.any():
-            continue
-        rows = slice(k * n, (k + 1) * n)
-        block = slopes[rows] / worse
-        apart = np.eye(n) - block @ covariance @ block.T
-        out[k] = float(residuals[rows] @ np.linalg.solve(apart, residuals[rows])) / int(known.sum())
-    return out

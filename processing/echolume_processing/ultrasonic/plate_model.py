@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from echolume_messages.geometry import Points3
 from echolume_processing.ultrasonic.acoustics import directivity
 
+
 def plate_paths(rig_from_array: NDArray[np.float64], emitter_mm: NDArray[np.float64], receivers_mm: Points3) -> Points3:
     """Path lengths (pings, receivers) over the plate z = 0 at array poses (pings, 4, 4)."""
     emitter = rig_from_array[:, :3, :3] @ emitter_mm + rig_from_array[:, :3, 3]

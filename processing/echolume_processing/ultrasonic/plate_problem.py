@@ -43,8 +43,8 @@ NAMES = (
 POSE, SPEED, RADIUS, LATENESS, FIXED = 9, 9, 10, 11, 12
 """Number of the pose's unknowns, places of speed, radius and lateness, and where the receivers' unknowns begin."""
 LATENESS_SIGMA = 5.0
-"""A disk that is tilted by t sends its echo later than an upright one, by an unknown number of times sin^2 t of its near
-field's lateness: far-field beams do not tell how many times."""
+"""A disk that is tilted by t sends its echo later than an upright one, by an unknown number of times sin^2 t of its
+near field's lateness: far-field beams do not tell how many times."""
 UPRIGHT = 0.01
 """Square of the sine of the tilt up to which a ping counts as upright."""
 STEP = 1e-4
@@ -78,8 +78,8 @@ class PlateData:
 
 
 class PlateProblem:
-    """Residuals and their slopes over one vector of unknowns: each in units of its prior sigma, then the delays in mm and
-    the level."""
+    """Residuals and their slopes over one vector of unknowns: each in units of its prior sigma, then the delays in mm
+    and the level."""
 
     def __init__(
         self, data: PlateData, emitter_mm: NDArray[np.float64], receivers_mm: Points3, nominal_flange_from_array: Matrix
@@ -199,7 +199,14 @@ class PlateProblem:
 
     def residuals(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
         """Paths, levels, direct sound and priors, each in its sigma."""
-        return np.concatenate([self.whitened(self.paths_left_mm(at)), self.level_left(at) / LEVEL_SIGMA, self._common(at), at[: self.priors]])
+        return np.concatenate(
+            [
+                self.whitened(self.paths_left_mm(at)),
+                self.level_left(at) / LEVEL_SIGMA,
+                self._common(at),
+                at[: self.priors],
+            ]
+        )
 
     def whitened(self, paths_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Rows of the paths (pings, receivers), in their sigma."""

@@ -123,6 +123,6 @@ def require_heights(paths_mm: NDArray[np.float64], heights_mm: NDArray[np.float6
     if abs(growth - 2) > 2 * UPRIGHT_SCALE:
         reason = "its z axis runs the other way" if growth < -1 else "its z axis is off, or the bench is not bare"
         raise CalibrationRejectedError(
-            f"array calibration: over the plate the echo's path grows by {growth:.2f} mm for each mm that the robot says "
-            f"it rises, 2 are expected: {reason}"
+            f"array calibration: over the plate the echo's path grows by {growth:.2f} mm for each mm that the robot "
+            f"says it rises, 2 are expected: {reason}"
         )

@@ -38,8 +38,8 @@ MIN_EXPLAINED = 0.3
 BUMP_MM = 0.25
 BUMP_RAD = float(np.radians(0.25))
 """The robot stands this much higher or more tilted over the block than over the plate: it was moved."""
-LAG_MM = 1.0
-"""Of path, by the envelopes alone: further than this, phases would lock on another cycle."""
+LAG_MM = 3.0
+"""Of path, by the envelopes alone: near half a wavelength phases would lock on another cycle."""
 MAX_LAG_MM = 40.0
 NOISE = 0.05
 """Share of the block's echo energy that no model explains."""
@@ -156,6 +156,12 @@ def fit_block(
         raise CalibrationRejectedError(f"array calibration: no pings over a block: undetermined: {', '.join(NAMES)}")
     scan = BlockScan(pings, optical_points_mm, calibration, gate_mm)
     lag_mm = scan.lag_mm()
+    if abs(lag_mm) > LAG_MM:
+        raise CalibrationRejectedError(
+            f"array calibration: over the block echoes come {lag_mm:+.1f} mm of path later than the plate's calibration "
+            "predicts; the robot, the bench or the block was moved after the pass 'plate', or the block is not the one "
+            "that light saw: repeat all passes"
+        )
     at, left, slopes = _gauss_newton(scan)
     explained = 1.0 - float(np.sum(left**2)) * scan.noise**2 / max(scan.power, 1e-12)
     independent = PULSE * max(1.0, float(np.mean(left**2)))
@@ -166,18 +172,16 @@ def fit_block(
     limits = (LIMIT_MM, LIMIT_MM, LIMIT_RAD)
     loose = [n for n, s, limit in zip(NAMES, sigmas, limits, strict=True) if s > limit]
     change = np.asarray(np.linalg.solve(information, -slopes.T @ left / independent), dtype=np.float64)[3:]
-    if abs(lag_mm) > LAG_MM and explained < 1 - MIN_EXPLAINED:
+    if explained < MIN_EXPLAINED:
         raise CalibrationRejectedError(
-            f"array calibration: over the block echoes come {lag_mm:.1f} mm of path later than the plate's calibration "
-            "predicts; the robot, the bench or the block was moved after the pass 'plate', or the block is not the one "
-            "that light saw: repeat all passes"
+            f"array calibration: {len(pings)} pings over the block explain {explained:.0%} of the block's echoes; {ASK}, "
+            "and leave robot and block where they were"
         )
-    if loose or explained < MIN_EXPLAINED:
-        reason = (
-            f"leave undetermined: {', '.join(loose)}" if loose else f"explain {explained:.0%} of the block's echoes"
-        )
-        raise CalibrationRejectedError(f"array calibration: {len(pings)} pings over the block {reason}; {ASK}")
     _require_same_stand(change)
+    if loose:
+        raise CalibrationRejectedError(
+            f"array calibration: {len(pings)} pings over the block leave undetermined: {', '.join(loose)}; {ASK}"
+        )
     return BlockFit(
         moved(calibration.robot_pose, at),
         dict(zip(NAMES, sigmas.tolist(), strict=True)),

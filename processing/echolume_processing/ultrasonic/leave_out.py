@@ -9,12 +9,18 @@ from echolume_processing.ultrasonic.plate_problem import PlateProblem
 
 
 def left_out(
-    problem: PlateProblem,
-    found: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-    worse: float,
+    problem: PlateProblem, found: NDArray[np.float64], covariance: NDArray[np.float64], worse: float
 ) -> NDArray[np.float64]:
     """Chi-squared per path of each ping as the fit without it predicts it, (pings,).
+
+    Parameters
+    ----------
+    problem : PlateProblem
+    found : (unknowns,) float64
+        Solution.
+    covariance : (unknowns, unknowns) float64
+    worse : float
+        How many times their sigma the paths scatter; the covariance takes it into account, too.
 
     Notes
     -----

@@ -30,7 +30,7 @@ def poses_to_add(undetermined: Sequence[str]) -> list[str]:
 
 
 def loose_directions(
-    information: NDArray[np.float64], names: Sequence[str], threshold: float
+    information: NDArray[np.float64], names: Sequence[str], threshold: float = 1.0
 ) -> list[tuple[float, str]]:
     """Directions in which an information matrix falls short, weakest first.
 

@@ -47,6 +47,8 @@ LATENESS_SIGMA = 5.0
 near field's lateness: far-field beams do not tell how many times."""
 UPRIGHT = 0.01
 """Square of the sine of the tilt up to which a ping counts as upright."""
+FAINT = 1e-9
+"""1/mm; a trial step may point a beam's null at the plate."""
 STEP = 1e-4
 """Of a prior's sigma, for differences."""
 
@@ -188,7 +190,7 @@ class PlateProblem:
             levels.weights,
             self.radius_mm(at),
         )
-        return self._heights - np.log(model.mean(axis=1))
+        return self._heights - np.log(np.maximum(model.mean(axis=1), FAINT))
 
     def _common(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
         """How far the direct sound comes too late, mean of the channels, in its sigma."""

@@ -111,9 +111,7 @@ def test_receivers_come_nearer_to_where_they_are():
         calibrated.append((found.receivers_mm - RECEIVERS_MM - truth.placement_mm)[:, :2])
         assert found.receivers_undetermined == ("z",)
         np.testing.assert_array_equal(found.receivers_mm[:, 2], RECEIVERS_MM[:, 2])
-    assert np.std(calibrated) < 0.75 * np.std(nominal)
-    within = np.array(calibrated) - np.mean(calibrated, axis=1, keepdims=True)
-    assert np.std(within) < 0.03
+    assert np.std(calibrated) < 0.35 * np.std(nominal)
 
 
 def test_heights_are_told_only_as_a_sum_and_the_fit_says_so():
@@ -151,11 +149,12 @@ def test_slopes_of_paths_with_places_are_those_of_the_paths():
         np.testing.assert_allclose(slopes[:, :, k], grown / 2e-4, atol=1e-7)
 
 
-def test_placements_have_no_turn_in_common():
+def test_placements_have_neither_turn_nor_shift_in_common():
     basis = placement_basis(EMITTER_MM, RECEIVERS_MM)
-    assert basis.shape == (24, 21)
+    assert basis.shape == (24, 18)
     for way in basis.T.reshape(-1, 8, 3):
         np.testing.assert_allclose(np.cross(RECEIVERS_MM, way).sum(axis=0), 0, atol=1e-6)
+        np.testing.assert_allclose(way.sum(axis=0), 0, atol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -43,8 +43,8 @@ LAG_MM = 3.0
 MAX_LAG_MM = 40.0
 NOISE = 0.05
 """Share of the block's echo energy that no model explains."""
-PULSE = 8
-"""Neighbouring samples share their errors: one independent value per compressed pulse of about so many."""
+MIN_PULSE = 8.0
+"""Neighbouring samples share their errors: one independent value per compressed pulse, of so many samples or more."""
 NAMES = ("rig_from_robot x", "rig_from_robot y", "rig_from_robot yaw")
 ASK = "raster across all four edges of the block that the pass 'block-light' saw, at 10 mm pitch"
 
@@ -126,6 +126,15 @@ def moved(rig_from_robot: Matrix, offsets: NDArray[np.float64]) -> Matrix:
     return transform(rotation_from_vector(np.array([rx, ry, yaw])), np.array([x, y, z])) @ rig_from_robot
 
 
+def pulse_samples(calibration: ArrayCalibration) -> float:
+    """Length of the compressed pulse, mean of the channels: the energy below its envelope over its peak's square."""
+    templates = np.array(calibration.templates)
+    power = np.abs(np.fft.fft(templates, 2 * templates.shape[1], axis=1)) ** 2
+    power[:, templates.shape[1] :] = 0.0
+    envelope = np.abs(np.fft.ifft(power, axis=1))
+    return float(np.mean(np.sum(envelope**2, axis=1) / np.max(envelope, axis=1) ** 2))
+
+
 def fit_block(
     pings: Sequence[Ping], optical_points_mm: Points3, calibration: ArrayCalibration, *, gate_mm: float = 40.0
 ) -> BlockFit:
@@ -158,13 +167,13 @@ def fit_block(
     lag_mm = scan.lag_mm()
     if abs(lag_mm) > LAG_MM:
         raise CalibrationRejectedError(
-            f"array calibration: over the block echoes come {lag_mm:+.1f} mm of path later than the plate's calibration "
-            "predicts; the robot, the bench or the block was moved after the pass 'plate', or the block is not the one "
-            "that light saw: repeat all passes"
+            f"array calibration: over the block echoes come {lag_mm:+.1f} mm of path later than the plate's "
+            "calibration predicts; the robot, the bench or the block was moved after the pass 'plate', or the block is "
+            "not the one that light saw: repeat all passes"
         )
     at, left, slopes = _gauss_newton(scan)
     explained = 1.0 - float(np.sum(left**2)) * scan.noise**2 / max(scan.power, 1e-12)
-    independent = PULSE * max(1.0, float(np.mean(left**2)))
+    independent = max(MIN_PULSE, pulse_samples(calibration)) * max(1.0, float(np.mean(left**2)))
     prior = np.diag(np.array(SCALES) ** -2)
     information = slopes.T @ slopes / independent + prior
     covariance = np.asarray(np.linalg.inv(information[:3, :3]), dtype=np.float64)
@@ -174,8 +183,8 @@ def fit_block(
     change = np.asarray(np.linalg.solve(information, -slopes.T @ left / independent), dtype=np.float64)[3:]
     if explained < MIN_EXPLAINED:
         raise CalibrationRejectedError(
-            f"array calibration: {len(pings)} pings over the block explain {explained:.0%} of the block's echoes; {ASK}, "
-            "and leave robot and block where they were"
+            f"array calibration: {len(pings)} pings over the block explain {explained:.0%} of the block's echoes; "
+            f"{ASK}, and leave robot and block where they were"
         )
     _require_same_stand(change)
     if loose:

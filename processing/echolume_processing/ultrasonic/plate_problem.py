@@ -58,14 +58,17 @@ def placement_basis(emitter_mm: NDArray[np.float64], receivers_mm: Points3) -> N
 
     Notes
     -----
-    A turn that all receivers share about the emitter is the array's own turn on the flange. It is left out: the array
-    frame is the one in which the receivers have none.
+    A turn that all receivers share about the emitter is the array's own turn on the flange, and a shift that they share
+    against the emitter passes, to first order, for half that shift of the array. Both are left out: the array frame is
+    the one in which the receivers have none.
     """
     arms = receivers_mm - emitter_mm
     sigma = np.tile(PLACEMENT_SIGMA_MM, len(arms))
-    turns = np.cross(np.eye(3)[:, None, :], arms).reshape(3, -1) * sigma
-    values, vectors = np.linalg.eigh(turns.T @ turns)
-    return sigma[:, None] * vectors[:, values < 1e-9 * values[-1]]
+    turns = np.cross(np.eye(3)[:, None, :], arms).reshape(3, -1)
+    shared = np.concatenate([turns, np.tile(np.eye(3), len(arms))]) * sigma
+    strength, ways = np.linalg.svd(shared)[1:]
+    rank = int(np.count_nonzero(strength > 1e-9 * strength[0]))
+    return np.asarray(sigma[:, None] * ways[rank:].T, dtype=np.float64)
 
 
 @dataclass(frozen=True)

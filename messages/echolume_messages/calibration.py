@@ -80,7 +80,8 @@ class ArrayCalibration(msgspec.Struct, forbid_unknown_fields=True, kw_only=True)
     rig_from_robot: Rows
     path_rms_mm: float
     receivers_sigma_mm: list[Vector3] | msgspec.UnsetType = msgspec.UNSET
-    """Standard deviation of each receiver's place. This and what follows is absent where nobody has estimated it."""
+    """Standard deviation of each receiver's place among the others. This and what follows is absent where nobody has
+    estimated it."""
     delay_covariance_s2: Rows | msgspec.UnsetType = msgspec.UNSET
     """(receivers, receivers)."""
     gains_sigma: list[float] | msgspec.UnsetType = msgspec.UNSET

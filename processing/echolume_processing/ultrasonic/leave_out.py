@@ -8,9 +8,7 @@ from numpy.typing import NDArray
 from echolume_processing.ultrasonic.plate_problem import PlateProblem
 
 
-def left_out(
-    problem: PlateProblem, found: NDArray[np.float64], covariance: NDArray[np.float64], worse: float
-) -> NDArray[np.float64]:
+def left_out(problem: PlateProblem, found: NDArray[np.float64], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
     """Chi-squared per path of each ping as the fit without it predicts it, (pings,).
 
     Parameters
@@ -19,15 +17,14 @@ def left_out(
     found : (unknowns,) float64
         Solution.
     covariance : (unknowns, unknowns) float64
-    worse : float
-        How many times their sigma the paths scatter; the covariance takes it into account, too.
+        Their scatter taken into account.
 
     Notes
     -----
     With e the ping's residuals in their sigma and H = J C J' its block of the hat matrix, the fit without it leaves
     (1 - H)^-1 e with the covariance (1 - H)^-1.
     """
-    n = problem.receivers
+    n, worse = problem.receivers, problem.scatter(found)
     slopes = problem.jacobian(found)
     residuals = problem.residuals(found) / worse
     out = np.full(len(problem.known), np.nan)

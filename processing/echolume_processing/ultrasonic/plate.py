@@ -18,8 +18,6 @@ from echolume_processing.ultrasonic.leave_out import left_out
 from echolume_processing.ultrasonic.observability import MISSING_POSES, loose_directions, poses_to_add
 from echolume_processing.ultrasonic.plate_model import Levels, plate_paths
 from echolume_processing.ultrasonic.plate_problem import (
-    CHANNEL_SIGMA_MM,
-    COMMON_SIGMA_MM,
     FIXED,
     NAMES,
     PLACEMENT_SIGMA_MM,
@@ -57,7 +55,6 @@ SURE = 0.25
 MAX_RMS_MM = 0.2
 MAX_SLIPS = 0.2
 """Share of the paths."""
-EXPECTED_MM = float(np.hypot(CHANNEL_SIGMA_MM, COMMON_SIGMA_MM))
 
 
 @dataclass(frozen=True)
@@ -74,6 +71,7 @@ class PlateFit:
     """(receivers, receivers)."""
     receivers_mm: Points3
     receivers_sigma_mm: Points3
+    """Of the places among each other: the array frame is the one in which they share neither shift nor turn."""
     receivers_undetermined: tuple[str, ...]
     """Axes along which the pings hardly tell where the receivers sit: there they stay nominal, with that sigma."""
     radius_mm: float
@@ -146,8 +144,7 @@ def fit_plate(
     rms = float(np.sqrt(np.mean(problem.paths_left_mm(found)[problem.known] ** 2)))
     slips = 1 - np.count_nonzero(problem.known) / max(1, np.count_nonzero(whole.known))
     _require_consistent(suspicion, rms, slips)
-    worse = max(1.0, rms / EXPECTED_MM)
-    covariance = _covariance(problem, found, worse)
+    covariance = _covariance(problem, found, problem.scatter(found))
     spread = np.sqrt(np.diag(covariance))
     _require_determined(spread, problem.sigmas, len(poses))
     left = np.where(problem.known, problem.paths_left_mm(found), np.nan)
@@ -179,7 +176,7 @@ def fit_plate(
         residuals_mm=left,
         undetermined=_loose_directions(covariance),
         suspicion=suspicion,
-        left_out=left_out(problem, found, covariance, worse),
+        left_out=left_out(problem, found, covariance),
     )
 
 

@@ -177,6 +177,11 @@ class PlateProblem:
         tilt = self._tilt_squared.ravel()
         return slopes[tilt <= tilt.min() + UPRIGHT].mean(axis=0)
 
+    def scatter(self, at: NDArray[np.float64]) -> float:
+        """How many times worse than expected the paths scatter, at least 1."""
+        left = self.paths_left_mm(at)[self.known]
+        return max(1.0, float(np.sqrt(np.mean(left**2) / (CHANNEL_SIGMA_MM**2 + COMMON_SIGMA_MM**2))))
+
     def level_left(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
         """Logarithm of measured over modelled amplitude, (loud pings,)."""
         return self._level_left(at) - at[-1]

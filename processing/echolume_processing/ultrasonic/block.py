@@ -23,7 +23,8 @@ from echolume_processing.ultrasonic.pipeline import (
 from echolume_processing.ultrasonic.predictor import BlockPredictor
 
 LATE_MM = 25.0
-"""Path compared after the top's echo: the plate's, with the block's shadow and the corner at its foot, is left out."""
+"""Path compared after the top's echo: the plate's, with the block's shadow and the corner at its foot, is left out,
+where the pulse is short enough to tell them apart."""
 PRIOR_MM = 3.0
 PRIOR_RAD = float(np.radians(3.0))
 SCALES = (PRIOR_MM, PRIOR_MM, PRIOR_RAD, 1.0, float(np.radians(0.5)), float(np.radians(0.5)))
@@ -74,6 +75,7 @@ class BlockScan:
         self._pings, self._calibration = pings, calibration
         self._pipeline = UltrasonicPipeline(calibration)
         self._speeds = [speed_of_sound_mps(calibration, p.air_temperature_c) for p in pings]
+        self._pulse_mm = 1e3 * self._speeds[0] * pulse_samples(calibration) / calibration.sample_rate_hz
         self._poses = [self._pipeline.rig_from_array(p.robot_pose) for p in pings]
         self._block = BlockPredictor(calibration, centres, areas, samples)
         self._bare = BlockPredictor(calibration, centres[:0], areas[:0], samples)
@@ -109,7 +111,9 @@ class BlockScan:
         rate = self._pings[k].sample_rate_hz * UPSAMPLING / (1e3 * self._speeds[k])
         late = float(np.mean(self._calibration.delays_s)) * 1e3 * self._speeds[k]
         path = 2 * (float(self._poses[k][2, 3]) - top_mm) + late
-        return slice(int(max(0.0, path - gate_mm) * rate), int((path + LATE_MM) * rate), UPSAMPLING)
+        apart = self._pulse_mm < 2 * top_mm
+        end = path + LATE_MM if apart else path + 2 * top_mm + gate_mm
+        return slice(int(max(0.0, path - gate_mm) * rate), int(end * rate), UPSAMPLING)
 
     def _predicted(self, model: BlockPredictor, k: int, offsets: NDArray[np.float64]) -> NDArray[np.complex64]:
         pose = moved(np.eye(4), offsets) @ self._poses[k]
@@ -158,7 +162,7 @@ def fit_block(
 
     Notes
     -----
-    Only the top's echo is compared. With the plate's echo beside the block, which a shadow and a double bounce at its
+    Only the top's echo is compared where the pulse is shorter than the two are apart. With the plate's echo beside the block, which a shadow and a double bounce at its
     foot change, x and y came out 0.2 to 0.4 mm off; without, 0.1 mm.
     """
     if not pings:

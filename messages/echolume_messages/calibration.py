@@ -79,6 +79,22 @@ class ArrayCalibration(msgspec.Struct, forbid_unknown_fields=True, kw_only=True)
     flange_from_array: Rows
     rig_from_robot: Rows
     path_rms_mm: float
+    receivers_sigma_mm: list[Vector3] | msgspec.UnsetType = msgspec.UNSET
+    """Standard deviation of each receiver's place among the others. This and what follows is absent where nobody has
+    estimated it."""
+    delay_covariance_s2: Rows | msgspec.UnsetType = msgspec.UNSET
+    """(receivers, receivers)."""
+    gains_sigma: list[float] | msgspec.UnsetType = msgspec.UNSET
+    radius_sigma_mm: float | msgspec.UnsetType = msgspec.UNSET
+    speed_sigma_mps: float | msgspec.UnsetType = msgspec.UNSET
+    footprint_mm: float | msgspec.UnsetType = msgspec.UNSET
+    """Radius of the first Fresnel zone at `reference_mm` and `footprint_hz`, as an edge's echo shows it; it goes with
+    the root of the distance."""
+    footprint_sigma_mm: float | msgspec.UnsetType = msgspec.UNSET
+    footprint_hz: float | msgspec.UnsetType = msgspec.UNSET
+    pose_covariance: Rows | msgspec.UnsetType = msgspec.UNSET
+    """(12, 12), mm and rad: x, y, z, rx, ry, yaw of `flange_from_array` in the array frame, then of `rig_from_robot` in
+    the rig frame."""
 
     @property
     def array_pose(self) -> NDArray[np.float64]:

@@ -13,6 +13,8 @@ from echolume_messages.rig import ArraySettings
 OFFSET_SIGMA_MM = 0.7
 """Mounting error per axis of the robot on the rig and of the array on the flange."""
 OFFSET_SIGMA_RAD = float(np.radians(0.3))
+PLACEMENT_SIGMA_MM = (0.1, 0.1, 0.05)
+"""How far a receiver sits from its drawing, per axis of the array frame."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,9 @@ class ArrayTruth:
     """Direct sound at each receiver, relative to a plate's echo at 150 mm (n,)."""
     flange_from_array: Matrix
     rig_from_robot: Matrix
+    placement_mm: NDArray[np.float64]
+    """How far each receiver sits from its drawing, seen from the emitter (n, 3). The array frame is laid so that they
+    have no turn in common."""
     thermometer_error_k: float
     """What the array's thermometer reads above the air on the sound's way."""
     pose_sigma_mm: float = 0.02
@@ -58,8 +63,18 @@ def _offset(rng: np.random.Generator) -> Matrix:
     return transform(rotation_from_vector(rng.normal(0, OFFSET_SIGMA_RAD, 3)), rng.normal(0, OFFSET_SIGMA_MM, 3))
 
 
+def _placement(seed: int, array: ArraySettings) -> NDArray[np.float64]:
+    """Scatter of the receivers around their drawing, from its own generator, less the turn that they share."""
+    arms = np.array(array.layout.receivers_mm, dtype=np.float64) - np.array(array.layout.emitter_mm)
+    scatter = np.random.default_rng([seed, 0x91ACE]).normal(0, PLACEMENT_SIGMA_MM, arms.shape)
+    turns = np.cross(np.eye(3)[:, None, :], arms).reshape(3, -1).T  # (3 n, 3): displacement by a turn about each axis
+    flat = scatter.ravel()
+    return (flat - turns @ np.linalg.lstsq(turns, flat, rcond=None)[0]).reshape(arms.shape)
+
+
 def array_truth(seed: int, array: ArraySettings) -> ArrayTruth:
-    """Draw an array from a seed: delays 20 to 60 us, gains +-15 %, radius +-2 %, mounting about 1 mm and 0.5 deg."""
+    """Draw an array from a seed: delays 20 to 60 us, gains +-15 %, radius +-2 %, receivers off by 0.1 mm, mounting
+    about 1 mm and 0.5 deg."""
     rng = np.random.default_rng([seed, 0xA88A])
     n = len(array.layout.receivers_mm)
     x, y, z, *angles_deg = array.nominal_flange_from_array_mm_deg
@@ -75,5 +90,6 @@ def array_truth(seed: int, array: ArraySettings) -> ArrayTruth:
         cross_talk=0.25 * rng.uniform(0.7, 1.3, n),
         flange_from_array=nominal @ _offset(rng),
         rig_from_robot=_offset(rng),
+        placement_mm=_placement(seed, array),
         thermometer_error_k=0.3 * float(rng.choice([-1.0, 1.0])) * rng.uniform(0.8, 1.2),
     )

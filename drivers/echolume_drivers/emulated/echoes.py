@@ -68,8 +68,9 @@ def _in_time(spectra: NDArray[np.complex128], samples: int) -> NDArray[np.float6
     return np.fft.irfft(spectra, n=samples, axis=1)
 
 
-def _element_paths(array: ArraySettings) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _element_paths(array: ArraySettings, truth: ArrayTruth) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     elements = np.array([array.layout.emitter_mm, *array.layout.receivers_mm], dtype=np.float64)
+    elements[1:] += truth.placement_mm
     return elements, np.linalg.norm(elements[1:] - elements[0], axis=1)
 
 
@@ -97,7 +98,7 @@ def echo_waveforms(
     require_shape("rig_from_array", rig_from_array, (4, 4))
     surface = surface_of(scene)
     facets = surface.facets
-    elements, direct_mm = _element_paths(array)
+    elements, direct_mm = _element_paths(array, truth)
     receivers = len(direct_mm)
     speed_mps = transducer.speed_of_sound_mps(temperature_c)
     bands_hz = np.array(transducer.BANDS[array.pulse])

@@ -25,12 +25,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Calibrate, write the calibration file, and report."""
+    """Calibrate, write the calibration file, and report; a refusal says why and writes nothing."""
     import msgspec
-    import numpy as np
 
     from echolume_messages import calibration as calibration_file
     from echolume_messages.files import require_place
+    from echolume_processing.ultrasonic import array_report
     from echolume_processing.ultrasonic.from_archive import calibrate_array_from_archive
 
     rig = load_rig(args.rig)
@@ -38,33 +38,10 @@ def run(args: argparse.Namespace) -> int:
     require_place(args.into, "--into")
     result = calibrate_array_from_archive(args.archive, before.left, before.right, before.laser, rig.array)
     calibration_file.save(msgspec.structs.replace(before, array=result.calibration), args.into)
-    plate, block = result.plate, result.block
-    sigmas = plate.sigmas | (block.sigmas if block is not None else {})
-    figures = {
-        "pings_used": result.pings_used,
-        "pings_rejected": result.pings_rejected,
-        "path_rms_mm": plate.path_rms_mm,
-        "level_rms": plate.level_rms,
-        "speed_of_sound_mps": plate.speed_mps,
-        "temperature_c": plate.temperature_c,
-        "radius_mm": plate.radius_mm,
-        "block_explained": block.explained if block is not None else None,
-        "sigmas": sigmas,
-    }
     if args.json:
-        sys.stdout.write(json.dumps(figures, indent=1) + "\n")
+        sys.stdout.write(json.dumps(array_report.figures(result, rig.array), indent=1) + "\n")
         return 0
-    rows = [
-        ("pings used", f"{result.pings_used}; left out: {result.pings_rejected or 'none'}"),
-        ("paths", f"{plate.path_rms_mm:.3f} mm rms"),
-        ("speed of sound", f"{plate.speed_mps:.2f} m/s at {plate.temperature_c:.1f} C"),
-        ("effective radius", f"{plate.radius_mm:.2f} mm"),
-    ]
-    for name, sigma in sigmas.items():
-        angle = name.endswith((" rx", " ry", " yaw"))
-        unit = "m/s" if name == "speed of sound" else "deg" if angle else "mm"
-        rows.append((name, f"sigma {np.degrees(sigma) if angle else sigma:.3f} {unit}"))
-    rows.append(("written", str(args.into)))
+    rows = [*array_report.lines(result, rig.array), ("written", str(args.into))]
     width = max(len(name) for name, _ in rows)
     sys.stdout.write("".join(f"{name:<{width}}  {value}\n" for name, value in rows))
     return 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import msgspec
 import numpy as np
@@ -15,10 +15,21 @@ from echolume_messages.geometry import Matrix, Points3, robot_from_flange, rotat
 from echolume_messages.rig import ArraySettings
 from echolume_processing.ping import Ping
 from echolume_processing.ultrasonic.air import speed_of_sound_mps
+from echolume_processing.ultrasonic.array_verdict import mispredicted, reasons, require_mounting, require_predicted
 from echolume_processing.ultrasonic.block import BlockFit, fit_block
-from echolume_processing.ultrasonic.pipeline import UPSAMPLING, UltrasonicPipeline, waveforms_from_counts
+from echolume_processing.ultrasonic.footprint import Footprint, fit_footprint
+from echolume_processing.ultrasonic.pipeline import (
+    MAX_PATH_MM,
+    MIN_PATH_MM,
+    UPSAMPLING,
+    UltrasonicPipeline,
+    waveforms_from_counts,
+)
 from echolume_processing.ultrasonic.plate import Levels, PlateFit, fit_plate, plate_paths
+from echolume_processing.ultrasonic.plate_problem import LEVEL_SIGMA
+from echolume_processing.ultrasonic.pose_covariance import joint_covariance
 from echolume_processing.ultrasonic.templates import Templates, cut_templates, reference_pings
+from echolume_processing.ultrasonic.wiring import require_heights, require_wiring
 
 REFERENCE_MM = 150.0
 """Height of the perpendicular pings that become the templates, where the plan offers a choice."""
@@ -27,7 +38,8 @@ GATE_MM = 60.0
 DIRECT_MM = 60.0
 """The direct sound arrives, electrical delay included, within this path."""
 MIN_DIRECT = 0.05
-MAX_RMS_MM = 0.3
+PING_RMS_MM = 0.3
+UPRIGHT = float(np.cos(np.radians(3.0)))
 MIN_PINGS = 6
 
 
@@ -41,6 +53,9 @@ class ArrayResult:
     pings_used: int
     pings_rejected: list[int]
     """Triggers whose paths do not fit the plate."""
+    footprint: Footprint | None = None
+    reasons: list[str] = field(default_factory=list[str])
+    """Why it was accepted, and what to know about it, in plain words."""
 
 
 def nominal_flange_from_array(settings: ArraySettings) -> Matrix:
@@ -119,6 +134,31 @@ def _direct_times(
     return np.where(clear, (peak + shift) / rate_hz, np.nan)
 
 
+def _gain_sigmas(levels: Levels, cut: Templates, slopes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Standard deviation of each channel's gain in counts, from how levels scatter among upright pings, (receivers,).
+
+    A ping's channels share most of it: with k pings averaged to the templates, a k-th of both variances remains.
+    """
+    upright = np.hypot(*slopes.T) < np.sin(np.arccos(UPRIGHT))
+    logs = np.log(levels.amplitudes[upright])
+    logs = logs[np.isfinite(logs).all(axis=1)]
+    apart = logs - logs.mean(axis=1, keepdims=True)
+    apart = apart - apart.mean(axis=0)
+    channel = float(np.sqrt(np.sum(apart**2) / max(1, (len(apart) - 1) * (apart.shape[1] - 1))))
+    return cut.peaks * np.hypot(LEVEL_SIGMA, channel) / np.sqrt(len(cut.pings))
+
+
+def _require_heights(pings: Sequence[Ping], calibration: ArrayCalibration, nominal: Matrix) -> None:
+    """Paths of upright pings, wherever they are, against the heights that the robot says."""
+    upright = [p for p in pings if (robot_from_flange(p.robot_pose) @ nominal)[2, 2] < -UPRIGHT]
+    pipeline = UltrasonicPipeline(calibration)
+    times_s = np.array([pipeline.strongest(p, (MIN_PATH_MM, MAX_PATH_MM))[0] for p in upright])
+    known = np.isfinite(times_s).any(axis=1)
+    paths = np.full(len(upright), np.nan)
+    paths[known] = 1e3 * calibration.speed_of_sound_mps * np.nanmedian(times_s[known], axis=1)
+    require_heights(paths, np.array([p.robot_pose[2] for p in upright]))
+
+
 def calibrate_plate(pings: Sequence[Ping], settings: ArraySettings) -> ArrayResult:
     """Everything that pings at tilted poses over the plate z = 0 can tell; x, y and yaw of the robot stay nominal.
 
@@ -133,21 +173,26 @@ def calibrate_plate(pings: Sequence[Ping], settings: ArraySettings) -> ArrayResu
         )
     nominal = nominal_flange_from_array(settings)
     provisional, cut, paths = _provisional(pings, settings, nominal)
+    _require_heights(pings, provisional, nominal)
     times, levels = _echoes(pings, provisional, paths)
     direct = _direct_times(pings, cut.pings, provisional)
     poses = np.array([p.robot_pose for p in pings])
     temperatures = np.array([p.air_temperature_c for p in pings])
     emitter, receivers = np.array(provisional.emitter_mm), np.array(provisional.receivers_mm)
+    slopes = np.array([(robot_from_flange(p) @ nominal)[2, :2] for p in poses])
+    require_wiring(times * (1e3 * provisional.speed_of_sound_mps), slopes, receivers)
 
     def fitted(kept: NDArray[np.bool_]) -> PlateFit:
         part = replace(levels, amplitudes=levels.amplitudes[kept])
         return fit_plate(poses[kept], times[kept], temperatures[kept], emitter, receivers, nominal, direct, part)
 
     fit = fitted(np.ones(len(pings), dtype=np.bool_))
+    require_mounting(fit, nominal)
+    require_predicted(fit, [p.trigger for p in pings])
     known = np.isfinite(fit.residuals_mm)
     spread = np.sqrt(np.nansum(fit.residuals_mm**2, axis=1) / np.maximum(known.sum(axis=1), 1))
-    limit_mm = max(MAX_RMS_MM, 4 * float(np.nanmedian(np.abs(fit.residuals_mm))))
-    good = (spread < limit_mm) & (known.sum(axis=1) >= len(receivers) / 2)
+    limit_mm = max(PING_RMS_MM, 4 * float(np.nanmedian(np.abs(fit.residuals_mm))))
+    good = (spread < limit_mm) & (known.sum(axis=1) >= len(receivers) / 2) & ~mispredicted(fit)
     if np.count_nonzero(good) < MIN_PINGS or np.count_nonzero(good) < 0.7 * len(pings):
         raise CalibrationRejectedError(
             f"array calibration: only {int(np.count_nonzero(good))} of {len(pings)} pings fit the plate (rms "
@@ -155,15 +200,11 @@ def calibrate_plate(pings: Sequence[Ping], settings: ArraySettings) -> ArrayResu
         )
     if not good.all():
         fit = fitted(good)
-    if fit.path_rms_mm > MAX_RMS_MM:
-        raise CalibrationRejectedError(
-            f"array calibration: paths over the plate scatter by {fit.path_rms_mm:.2f} mm rms, at most {MAX_RMS_MM} is "
-            "accepted; is the bench bare and flat?"
-        )
     array_pose = fit.rig_from_robot @ robot_from_flange(poses[cut.pings[0]])
     array_pose = array_pose @ fit.flange_from_array
     calibration = msgspec.structs.replace(
         provisional,
+        receivers_mm=[(x, y, z) for x, y, z in fit.receivers_mm.tolist()],
         radius_mm=fit.radius_mm,
         delays_s=fit.delays_s.tolist(),
         reference_mm=float((array_pose[:3, :3] @ emitter + array_pose[:3, 3])[2]),
@@ -172,9 +213,14 @@ def calibrate_plate(pings: Sequence[Ping], settings: ArraySettings) -> ArrayResu
         flange_from_array=fit.flange_from_array.tolist(),
         rig_from_robot=fit.rig_from_robot.tolist(),
         path_rms_mm=fit.path_rms_mm,
+        receivers_sigma_mm=[(x, y, z) for x, y, z in fit.receivers_sigma_mm.tolist()],
+        delay_covariance_s2=fit.delay_covariance_s2.tolist(),
+        gains_sigma=_gain_sigmas(levels, cut, slopes).tolist(),
+        radius_sigma_mm=fit.radius_sigma_mm,
+        speed_sigma_mps=fit.sigmas["speed of sound"],
     )
     rejected = [pings[int(k)].trigger for k in np.flatnonzero(~good)]
-    return ArrayResult(calibration, fit, None, int(np.count_nonzero(good)), rejected)
+    return ArrayResult(calibration, fit, None, int(np.count_nonzero(good)), rejected, None, reasons(fit, None))
 
 
 def calibrate_array(
@@ -197,9 +243,22 @@ def calibrate_array(
     Raises
     ------
     CalibrationRejectedError
-        With the reason, and the name of what stays undetermined.
+        With the reason in plain words: what stays undetermined (and the poses that would determine it), what is wired
+        or counted the wrong way round, or what was moved.
     """
     plate = calibrate_plate(pings_plate, settings)
     block = fit_block(pings_block, optical_block_points_mm, plate.calibration)
     calibration = msgspec.structs.replace(plate.calibration, rig_from_robot=block.rig_from_robot.tolist())
-    return ArrayResult(calibration, plate.plate, block, plate.pings_used, plate.pings_rejected)
+    poses = np.array([p.robot_pose for p in pings_block])
+    covariance = joint_covariance(calibration, plate.plate.pose_covariance, block.covariance, poses)
+    footprint = fit_footprint(pings_block, optical_block_points_mm, calibration)
+    radius_mm, sigma_mm = footprint.at(calibration.reference_mm)
+    calibration = msgspec.structs.replace(
+        calibration,
+        pose_covariance=covariance.tolist(),
+        footprint_mm=radius_mm,
+        footprint_sigma_mm=sigma_mm,
+        footprint_hz=footprint.frequency_hz,
+    )
+    found = reasons(plate.plate, footprint)
+    return ArrayResult(calibration, plate.plate, block, plate.pings_used, plate.pings_rejected, footprint, found)

@@ -43,6 +43,9 @@ class BlockPredictor:
         self._source = spectrum * phase * 2 * found.reference_mm
         self._emitter_mm = np.array(found.emitter_mm)
         self._receivers_mm = np.array(found.receivers_mm)
+        self._late_mm2 = 0.5 * found.radius_mm**2
+        """Lateness of the echo between two disks, times its path; at the reference it belongs to the delays."""
+        self._reference_late_mm = self._late_mm2 / (2 * found.reference_mm)
 
     def predict(self, rig_from_array: NDArray[np.float64], start_s: float, speed_mps: float) -> Waveforms:
         """Echoes at one array pose (4, 4), float32 counts (receivers, samples)."""
@@ -75,7 +78,8 @@ class BlockPredictor:
         out_way = way * np.array([1.0, 1.0, -1.0])
         sine_out = np.sqrt(np.maximum(1 - (out_way @ axis / path) ** 2, 0.0))
         level = directivity(ka * sine_in) * directivity(ka * sine_out) / path
-        return level[:, None] * np.exp(-2j * np.pi * self._frequency_hz * (path / speed - start_s)[:, None])
+        late = path + self._late_mm2 / path - self._reference_late_mm
+        return level[:, None] * np.exp(-2j * np.pi * self._frequency_hz * (late / speed - start_s)[:, None])
 
     def _facets(
         self,
@@ -99,7 +103,9 @@ class BlockPredictor:
             level_in = directivity(ka * np.sqrt(np.maximum(1 - (up @ axis / back) ** 2, 0.0))) / back
             obliquity = 0.5 * (np.abs(down[:, 2]) / there + np.abs(up[:, 2]) / back)
             weight = level_out * level_in * obliquity * (self._area_mm2 / (2 * np.pi * speed))
-            at = ((there + back) / speed - start_s) * rate
+            # A disk is late by R^2 / (4 r) at each point; summed over a plate, far-field beams take half of it away.
+            late = there + back + 0.5 * self._late_mm2 * (1 / there + 1 / back) - self._reference_late_mm
+            at = (late / speed - start_s) * rate
             whole = at.astype(np.int64)
             part = at - whole
             row = np.asarray(np.bincount(whole, weight * (1 - part), bins), dtype=np.float64)[:bins]

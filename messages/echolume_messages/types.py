@@ -74,6 +74,12 @@ ULTRASONIC_POINT = np.dtype(
         ("ny", "<f4"),
         ("nz", "<f4"),
         ("sigma_mm", "<f4"),
+        ("xx_mm2", "<f4"),  # covariance of the place, rig frame: noise, air and the robot's repeatability
+        ("xy_mm2", "<f4"),
+        ("xz_mm2", "<f4"),
+        ("yy_mm2", "<f4"),
+        ("yz_mm2", "<f4"),
+        ("zz_mm2", "<f4"),
         ("path_mm", "<f4"),
         ("energy", "<f4"),
         ("lobes", "u1"),
@@ -81,7 +87,10 @@ ULTRASONIC_POINT = np.dtype(
         ("kind", "u1"),  # EchoKind
     ]
 )
-"""A contact point of one receiver of one ping, rig frame, normal towards the array."""
+"""A contact point of one receiver of one ping, rig frame, normal towards the array.
+
+The covariance is not a number where no surface explains the ping, infinite along what the array's layout leaves open,
+and without what the calibration leaves uncertain, which is the same for all pings."""
 
 MAP_CELL = np.dtype(
     [

@@ -446,6 +446,9 @@ def test_what_is_no_archive_is_refused(
     if command[0] == "calibrate" and "is empty" in named:
         assert (code, "is this the archive of a calibration scan?" in said) == (6, True)
         return
+    if command[0] == "calibrate" and content == "folder":
+        assert (code, "needs the guide's position at each image" in said) == (2, True), said
+        return
     assert (code, named in said) == (7, True), said
     assert not (shell.folder / "reprocessed").exists()
 

@@ -481,6 +481,21 @@ def test_contacts_of_emulated_pings_are_as_good_as_they_say(pipeline: Ultrasonic
     assert rms(np.array(errors)) < 0.35
 
 
+def test_published_points_carry_covariances_that_hold(pipeline: UltrasonicPipeline, tilted: list[Ping]):
+    """Points lie within the plate, whose height alone is known: z."""
+    ratios = []
+    for ping in tilted:
+        points = pipeline.process(ping)
+        rows = [[points[f"{a}{b}_mm2"] for b in "xyz"] for a in "x"] + [
+            [points["xy_mm2"], points["yy_mm2"], points["yz_mm2"]],
+            [points["xz_mm2"], points["yz_mm2"], points["zz_mm2"]],
+        ]
+        covariance = np.array(rows, dtype=float).transpose(2, 0, 1)
+        assert (np.linalg.eigvalsh(covariance) > 0).all()
+        ratios.append(points["z_mm"].astype(float) ** 2 / points["zz_mm2"])
+    assert 0.3 < np.concatenate(ratios).mean() < 1.6
+
+
 def test_the_energy_of_emulated_pings_witnesses_their_normals(pipeline: UltrasonicPipeline, tilted: list[Ping]):
     """Scaled by distance squared; the curve is from one half of the pings, the witness heard on the other."""
     angles, energies, normals = [], [], []

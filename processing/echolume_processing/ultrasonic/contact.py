@@ -129,6 +129,7 @@ def contact(
     paths_mm: NDArray[np.float64],
     sigma_mm: NDArray[np.float64],
     *,
+    common_sigma_mm: float = 0.0,
     max_chi_squared: float = MAX_CHI_SQUARED,
     max_tilt_rad: float = MAX_TILT_RAD,
 ) -> Contact:
@@ -141,6 +142,8 @@ def contact(
     paths_mm : (receivers,) float64
         Not a number where a channel has no echo.
     sigma_mm : (receivers,) float64
+    common_sigma_mm : float
+        Of an error that all paths share; it enters the covariances only.
     max_chi_squared : float
         Per degree of freedom; a model above it is not believed.
     max_tilt_rad : float
@@ -157,7 +160,14 @@ def contact(
     """
     require_shape("paths_mm", paths_mm, (len(receivers_mm),))
     require_shape("sigma_mm", sigma_mm, (len(receivers_mm),))
-    found = contacts(receivers_mm, paths_mm[None], sigma_mm, max_chi_squared=max_chi_squared, max_tilt_rad=max_tilt_rad)
+    found = contacts(
+        receivers_mm,
+        paths_mm[None],
+        sigma_mm,
+        common_sigma_mm=common_sigma_mm,
+        max_chi_squared=max_chi_squared,
+        max_tilt_rad=max_tilt_rad,
+    )
     kind = EchoKind(int(found.kind[0]))
     scores = (np.inf, float(found.plane_chi_squared[0]), float(found.point_chi_squared[0]))
     normals = np.empty(receivers_mm.shape)

@@ -36,6 +36,11 @@ SURFACE = 0.45
 little less to keep bars narrower than the Fresnel zone."""
 PATH_FLOOR_MM = 0.05
 """What the model leaves unexplained of a path on a clean plane."""
+COMMON_PATH_MM = 0.05
+"""What all paths of a ping share: the robot's repeatability and the air."""
+COVARIANCE = {
+    "xx_mm2": (0, 0), "xy_mm2": (0, 1), "xz_mm2": (0, 2), "yy_mm2": (1, 1), "yz_mm2": (1, 2), "zz_mm2": (2, 2),
+}  # fmt: skip
 UPSAMPLING = 4
 
 
@@ -187,7 +192,7 @@ class UltrasonicPipeline:
             period_s = 1 / echoes.bank.centre_hz
             found, paths_mm = settled(found, paths_mm, self._receivers_mm, period_s, speed, PATH_FLOOR_MM)
         sigma_mm = np.hypot(PATH_FLOOR_MM, np.where(found.found, found.sigma_s * speed, 0.0))
-        result = contact(self._receivers_mm, paths_mm, sigma_mm)
+        result = contact(self._receivers_mm, paths_mm, sigma_mm, common_sigma_mm=COMMON_PATH_MM)
         pose = self.rig_from_array(robot_pose)
         used = np.flatnonzero(result.used)
         points = apply(pose, result.points_mm[used] + self._emitter_mm)
@@ -197,6 +202,9 @@ class UltrasonicPipeline:
             out[name] = values
         for name, values in zip(("nx", "ny", "nz"), normals.T, strict=True):
             out[name] = values
+        turned = pose[:3, :3] @ result.point_covariances[used] @ pose[:3, :3].T
+        for name, (i, j) in COVARIANCE.items():
+            out[name] = turned[:, i, j]
         out["sigma_mm"] = 0.5 * sigma_mm[used]
         out["path_mm"] = paths_mm[used]
         first_s, last_s = (length / speed - start_s - cut_s for length in self._gate_mm)

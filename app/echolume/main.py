@@ -27,6 +27,8 @@ SUMMARIES = {
     "calibrate": "calibrate cameras, laser or array",
     "process": "run one of the lab's subscribers",
     "reprocess": "rebuild the hybrid map from a raw archive",
+    "export": "write a hybrid map as PLY, LAS, E57, mesh or npz",
+    "evaluate": "score a hybrid map against the truth",
     "localise": "locate a target in recorded echoes of a 1+N array",
 }
 

@@ -113,10 +113,8 @@ def _plates(
 ) -> list[Plate]:
     number, count = components(real[:, 1:] & real[:, :-1], real[1:] & real[:-1])
     plates: list[Plate] = []
-    for k in range(count):
+    for k in np.flatnonzero(np.bincount(number[real], minlength=count) >= SMALLEST_PLATE):
         at = (number == k) & real
-        if int(at.sum()) < SMALLEST_PLATE:
-            continue
         iy, ix = np.nonzero(at)
         plates.append(
             Plate(

@@ -120,13 +120,14 @@ def points_of(cells: NDArray[np.bool_], height_mm: NDArray[np.float64], field: M
     iy, ix = np.nonzero(cells)
     x_mm = field.x_mm[0] + (ix + 0.5) * field.cell_mm
     y_mm = field.y_mm[0] + (iy + 0.5) * field.cell_mm
-    return np.stack([x_mm, y_mm, height_mm[cells]], axis=1)
+    return np.asarray(np.stack([x_mm, y_mm, height_mm[cells]], axis=1), dtype=np.float64)
 
 
 def distance_mm(cells: NDArray[np.bool_], field: MapField) -> NDArray[np.float64]:
     """How far each cell's centre is from the outline of other cells; 0 inside them."""
-    cells_away = np.asarray(distance_transform_edt(~cells), dtype=np.float64)
-    return np.asarray(np.where(cells, 0.0, (cells_away - 0.5) * field.cell_mm), dtype=np.float64)
+    away_mm = np.zeros(cells.shape)
+    away_mm[~cells] = (np.asarray(distance_transform_edt(~cells))[~cells] - 0.5) * field.cell_mm
+    return away_mm
 
 
 def _inside_mm(cells: NDArray[np.bool_], field: MapField) -> NDArray[np.float64]:

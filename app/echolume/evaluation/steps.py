@@ -29,6 +29,8 @@ class Step(TypedDict):
     nominal_mm: float
     measured_mm: float
     error_mm: float
+    sigma_mm: float
+    """Of the height, taking the residual for noise; large where the two sides tell little of their tilt."""
     residual_mm: float
     """RMS distance of the cells from the two planes."""
     cells: int
@@ -87,8 +89,8 @@ def _step(map_: Claimed, truth: Reference, one: Region, other: Region, field: Ma
     if min(int(side.sum()) for side in sides) < FEWEST:
         return None
     used = sides[0] | sides[1]
-    measured_mm, residual_mm = height_of_step(points_of(used, map_.front_mm, field), sides[1][used])
-    nominal_mm, _ = height_of_step(points_of(used, truth.front_mm, field), sides[1][used])
+    measured_mm, sigma_mm, residual_mm = height_of_step(points_of(used, map_.front_mm, field), sides[1][used])
+    nominal_mm, *_ = height_of_step(points_of(used, truth.front_mm, field), sides[1][used])
     edge = points_of(one.cells & (distance_mm(other.cells, field) < field.cell_mm), truth.front_mm, field)
     return Step(
         x_mm=float(edge[:, 0].mean()),
@@ -96,18 +98,20 @@ def _step(map_: Claimed, truth: Reference, one: Region, other: Region, field: Ma
         nominal_mm=nominal_mm,
         measured_mm=measured_mm,
         error_mm=measured_mm - nominal_mm,
+        sigma_mm=sigma_mm,
         residual_mm=residual_mm,
         cells=int(used.sum()),
         sense=sense_of(map_, used),
     )
 
 
-def height_of_step(points_mm: NDArray[np.float64], upper: NDArray[np.bool_]) -> tuple[float, float]:
-    """Distance in z of two parallel planes through points (n, 3), and the RMS of what is left."""
+def height_of_step(points_mm: NDArray[np.float64], upper: NDArray[np.bool_]) -> tuple[float, float, float]:
+    """Distance in z of two parallel planes through points (n, 3), its sigma, and the RMS of what is left."""
     x, y, z = (points_mm - points_mm.mean(axis=0)).T
     design = np.column_stack([x, y, np.ones_like(x), upper.astype(np.float64)])
     solved, *_ = np.linalg.lstsq(design, z, rcond=None)
-    return float(solved[3]), float(np.sqrt(np.mean((z - design @ solved) ** 2)))
+    residual_mm = float(np.sqrt(np.sum((z - design @ solved) ** 2) / max(1, z.size - 4)))
+    return float(solved[3]), residual_mm * float(np.sqrt(np.linalg.pinv(design.T @ design)[3, 3])), residual_mm
 
 
 def _beside(one: NDArray[np.bool_], other: NDArray[np.bool_]) -> int:

@@ -74,7 +74,7 @@ def _glass(found: Evaluation) -> str:
 def _metrology(found: Evaluation) -> Iterable[str]:
     made = found["metrology"]
     if made["steps"]:
-        keys = ("x_mm", "y_mm", "nominal_mm", "measured_mm", "error_mm", "residual_mm", "cells", "sense")
+        keys = ("x_mm", "y_mm", "nominal_mm", "measured_mm", "error_mm", "sigma_mm", "residual_mm", "cells", "sense")
         yield _rows(("step", *keys), [(str(k + 1), *(row[key] for key in keys)) for k, row in enumerate(made["steps"])])
         yield _rows(
             ("steps by sense", "count", "rms_mm", "worst_mm"),

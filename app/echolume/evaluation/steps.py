@@ -56,7 +56,7 @@ def steps(map_: Claimed, truth: Reference, found: list[Region], field: MapField)
 
     References
     ----------
-    ISO 5436-1:2000, 7: that standard describes profiles of grooves; the same fit is made here over areas.
+    ISO 5436-1:2000 (now in ISO 25178-70:2014) has this fit for profiles over grooves; here it is made over areas.
     """
     level = [region for region in found if region.shape == "level"]
     made = (_step(map_, truth, one, other, field) for one, other in combinations(level, 2))

@@ -77,8 +77,9 @@ def triangles(height_mm: NDArray[np.floating], tallest_mm: float) -> NDArray[np.
     lower = np.stack([a, b, np.where(first, c, d)], axis=1)
     upper = np.stack([np.where(first, a, b), c, d], axis=1)
     corners = np.concatenate([lower, upper])
-    corner_mm = z_mm[corners]
-    return corners[np.isfinite(corner_mm).all(axis=1) & (np.ptp(corner_mm, axis=1) <= tallest_mm)]
+    p_mm, q_mm, r_mm = (z_mm[column] for column in corners.T)
+    highest_mm, lowest_mm = np.maximum(np.maximum(p_mm, q_mm), r_mm), np.minimum(np.minimum(p_mm, q_mm), r_mm)
+    return corners[np.isfinite(highest_mm) & (highest_mm - lowest_mm <= tallest_mm)]
 
 
 def write(stored: StoredMap, path: Path, walls: bool = False) -> int:

@@ -11,7 +11,6 @@ import numpy as np
 from echolume_messages.errors import ConfigError
 from echolume_messages.files import replacing
 from echolume_messages.types import Label, Structured
-from echolume_processing.hybrid.digest import digest
 from echolume_processing.hybrid.model import HybridMap, cell_centres_mm
 from echolume_processing.hybrid.stored import RECORD, About, StoredMap, blocks, put_back, unmeasured, with_height
 
@@ -87,15 +86,16 @@ def vertices(found: HybridMap, cells: Structured) -> Structured:
 def header(stored: StoredMap, elements: Sequence[tuple[str, int, np.dtype[np.void]]]) -> bytes:
     """Header of a PLY file with what is known about its map as comments."""
     names = ", ".join(f"{label.value} {label.name.lower()}" for label in Label)
-    about = About.of(stored).text()
+    about = About.of(stored)
+    text = about.text()
     lines = [
         "ply",
         "format binary_little_endian 1.0",
-        f"comment echolume hybrid map, millimetres, digest {digest(stored.found)}",
+        f"comment echolume hybrid map, millimetres, digest {about.digest}",
         f"comment label: {names}",
         "comment provenance bits: 1 stereo, 2 active left, 4 active right, 8 ultrasonic, 16 filled",
         *(f"comment note: {one_line(note)}" for note in stored.found.notes),
-        *(f"comment about:{about[k : k + PER_COMMENT]}" for k in range(0, len(about), PER_COMMENT)),
+        *(f"comment about:{text[k : k + PER_COMMENT]}" for k in range(0, len(text), PER_COMMENT)),
     ]
     for name, count, dtype in elements:
         lines.append(f"element {name} {count}")

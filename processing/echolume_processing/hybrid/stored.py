@@ -105,21 +105,23 @@ def with_height(found: HybridMap) -> NDArray[np.bool_]:
 
 def unmeasured(found: HybridMap) -> Structured:
     """Records of the cells without a height that say anything at all, e.g. that pings passed there unheard."""
-    cells, empty = found.cells, empty_cells(found.field)
+    cells, empty = found.cells[~with_height(found)], empty_cells(MapField((0.0, 1.0), (0.0, 1.0), 1.0))
     says = np.zeros(cells.size, dtype=np.bool_)
     for name in FIELDS:
         same = cells[name] == empty[name]
         if MAP_CELL[name].kind == "f":
             same |= np.isnan(cells[name]) & np.isnan(empty[name])
         says |= ~same
-    return cells[says & ~with_height(found)].astype(RECORD)
+    return cells[says].astype(RECORD)
 
 
 def blocks(found: HybridMap, which: NDArray[np.bool_]) -> Generator[Structured]:
     """The chosen cells, some at a time."""
     places = np.flatnonzero(which)
     for start in range(0, places.size, BLOCK):
-        yield found.cells[places[start : start + BLOCK]]
+        at = places[start : start + BLOCK]
+        gapless = at[-1] - at[0] == at.size - 1
+        yield found.cells[at[0] : at[-1] + 1] if gapless else found.cells[at]
 
 
 def put_back(about: About, parts: list[Structured], path: Path) -> Structured:
@@ -132,7 +134,7 @@ def put_back(about: About, parts: list[Structured], path: Path) -> Structured:
     """
     cells = empty_cells(about.field)
     rows, columns = about.field.shape
-    taken = np.zeros(cells.size, dtype=np.bool_)
+    times = np.zeros(cells.size, dtype=np.int64)
     for part in parts:
         missing = [name for name in RECORD.names or () if name not in (part.dtype.names or ())]
         if missing:
@@ -141,9 +143,9 @@ def put_back(about: About, parts: list[Structured], path: Path) -> Structured:
         if ((ix < 0) | (ix >= columns) | (iy < 0) | (iy >= rows)).any():
             raise ConfigError(f"{path}: holds cells beyond its field of {rows} rows and {columns} columns")
         at = iy * columns + ix
-        if taken[at].any() or np.unique(at).size != at.size:
+        times += np.bincount(at, minlength=cells.size)
+        if times.max(initial=0) > 1:
             raise ConfigError(f"{path}: holds a cell twice")
-        taken[at] = True
         for name in FIELDS:
             cells[name][at] = part[name]
     return cells

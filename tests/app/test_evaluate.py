@@ -279,6 +279,21 @@ def test_a_glossy_surface_may_have_any_label(tmp_path: Path) -> None:
     assert (found["glass"], found["all"]["glass_recall"]) == (None, None)
 
 
+def test_a_truth_may_ask_for_the_unknown(case: Case) -> None:
+    asked = np.full((240, 240), -1)
+    asked[40:60, 40:60] = Label.UNKNOWN
+    with np.load(case.truth_path) as images:
+        kept = dict(images)
+    np.savez(case.truth_path, **kept, label=asked)
+    case.image["label"][20:40, 20:30], case.image["front_mm"][20:40, 20:30] = Label.UNKNOWN, np.nan
+    found = case.scores()
+    assert found["labels"] is not None
+    assert found["labels"]["unknown"] == {"truth": 400, "named": 200, "recall": 0.5, "precision": 1.0}
+    assert found["labels"]["transparent"]["recall"] is None
+    assert found["confusion"] is not None
+    assert sum(found["confusion"]["any"].values()) == 40000 - 400
+
+
 def test_glass_height_is_the_median_and_plates_are_told_apart(tmp_path: Path) -> None:
     scene = SceneBuilder("two").box((-60, -20), (-20, 20), 30.0, Material.GLASS)
     case = Case.of(scene.box((20, 60), (-20, 20), 10.0, Material.GLASS).build(), tmp_path, sigma_mm=0.0)
@@ -426,6 +441,7 @@ BAD: dict[str, tuple[Change, str]] = {
     "truth without heights": (_without("front_mm"), "lacks front_mm"),
     "truth whose images differ": (_with("material", np.zeros((3, 3), np.uint8)), "material: expected an image"),
     "truth whose corner is no number": (_with("y0_mm", "left"), "y0_mm: expected a number"),
+    "truth with labels that are none": (_with("label", np.full((240, 240), 9)), "label: expected -1"),
     "truth that knows nothing": (_with("front_mm", np.full((240, 240), np.nan)), "knows no height"),
     "truth cut short": (_cut, "cut short"),
     "map cut short": (_cut_map, "cut short"),

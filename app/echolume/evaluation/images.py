@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from echolume.scoring import window
+from echolume.scoring import GLASS, window
 from echolume_messages.errors import ConfigError
 from echolume_messages.plan import MapField
 from echolume_messages.types import Label
@@ -83,6 +83,11 @@ def reference(path: Path, field: MapField) -> Reference:
     ------
     ConfigError
         It is neither, lies on another raster, or does not cover the map.
+
+    Notes
+    -----
+    In ``truth.npz`` the materials say what each cell should be called, unless there is an image ``label`` that does:
+    ``Label``, or -1 where any will do. It may ask for *unknown*, as on glass tilted beyond the echo's return.
     """
     if path.is_dir():
         raise ConfigError(f"{path}: is a folder; give the truth in it, e.g. {path / 'truth.npz'}")
@@ -98,18 +103,29 @@ def _of_truth(images: dict[str, NDArray[Any]], field: MapField, path: Path) -> R
     if missing:
         raise ConfigError(f"{path}: lacks {', '.join(missing)}; expected the truth.npz of the emulated rig")
     shape = images["front_mm"].shape
-    for name in ("optical_mm", "material"):
+    for name in ("optical_mm", "material", *(["label"] if "label" in images else [])):
         if len(shape) != 2 or images[name].shape != shape:
             raise ConfigError(f"{path}: {name}: expected an image like front_mm {shape}, got {images[name].shape}")
     x0_mm, y0_mm, cell_mm = (_number(images[name], name, path) for name in TRUTH_FIELDS[3:])
     at = _window(shape, x0_mm, y0_mm, cell_mm, field, path)
     material = images["material"][at].astype(np.int64)
+    label = _labels(images["label"][at], path) if "label" in images else _labels_of(material)
+    front_mm = images["front_mm"][at].astype(np.float64)
+    behind_mm = np.where(material == GLASS, images["optical_mm"][at].astype(np.float64), np.nan)
+    return Reference(front_mm, behind_mm, label, np.zeros_like(front_mm), "truth of the emulated rig")
+
+
+def _labels_of(material: NDArray[np.int64]) -> NDArray[np.int64]:
     label = np.full(material.shape, NOT_ASKED)
     for code, wanted in MATERIAL_LABEL.items():
         label[material == code] = wanted
-    front_mm = images["front_mm"][at].astype(np.float64)
-    behind_mm = np.where(label == Label.TRANSPARENT, images["optical_mm"][at].astype(np.float64), np.nan)
-    return Reference(front_mm, behind_mm, label, np.zeros_like(front_mm), "truth of the emulated rig")
+    return label
+
+
+def _labels(label: NDArray[Any], path: Path) -> NDArray[np.int64]:
+    if label.dtype.kind not in "iu" or not np.isin(label, (NOT_ASKED, *Label)).all():
+        raise ConfigError(f"{path}: label: expected {NOT_ASKED} (any) to {max(Label)}, got others")
+    return label.astype(np.int64)
 
 
 def _number(value: NDArray[Any], name: str, path: Path) -> float:

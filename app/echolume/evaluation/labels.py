@@ -55,8 +55,8 @@ def label_scores(label: NDArray[np.int64], truth: NDArray[np.int64]) -> dict[str
 
     Notes
     -----
-    The truth of the emulated rig names materials: of no cell does it say that it should be occluded or unknown, so
-    these two have neither recall nor precision.
+    Materials do not say of any cell that it should be occluded or unknown: against them these two have neither recall
+    nor precision.
     """
     asked = truth != NOT_ASKED
     known = {int(v) for v in np.unique(truth[asked])}

@@ -271,6 +271,8 @@ def test_an_npz_without_a_field_is_refused_and_the_field_named(name: str, tmp_pa
         ("sigma_mm", np.zeros(FIELD.shape), "expected float32"),
         ("x_mm", np.array([1.0, -1.0]), "describe no field"),
         ("x_mm", np.array([1.0]), "not what a map has"),
+        ("x_mm", np.array([-1.0, np.inf]), "describe no field"),
+        ("cell_mm", np.array(1e-9), "too many"),
         ("x_mm", np.array([-30.0, 10.0]), "but it says"),
         ("about", np.array("{}"), "cannot be read"),
         ("about", np.array("{"), "cannot be read"),

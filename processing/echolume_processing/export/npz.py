@@ -15,7 +15,7 @@ from echolume_messages.files import replacing
 from echolume_messages.plan import MapField
 from echolume_messages.types import MAP_CELL
 from echolume_processing.hybrid.model import HybridMap, Registration, empty_cells
-from echolume_processing.hybrid.stored import FIELDS, About, StoredMap
+from echolume_processing.hybrid.stored import FIELDS, About, StoredMap, require_field
 
 ABOUT = ("about", "x_mm", "y_mm", "cell_mm")
 
@@ -96,6 +96,8 @@ def _field(images: dict[str, NDArray[Any]], path: Path) -> MapField:
         cell_mm = float(images["cell_mm"])
     except (TypeError, ValueError) as error:
         raise ConfigError(f"{path}: x_mm, y_mm or cell_mm is not what a map has: {error}") from error
-    if not (x1_mm > x0_mm and y1_mm > y0_mm and cell_mm > 0):
+    if not (x1_mm > x0_mm and y1_mm > y0_mm and cell_mm > 0 and np.isfinite([x0_mm, x1_mm, y0_mm, y1_mm]).all()):
         raise ConfigError(f"{path}: x_mm, y_mm and cell_mm describe no field: {x0_mm, x1_mm, y0_mm, y1_mm, cell_mm}")
-    return MapField(x_mm=(x0_mm, x1_mm), y_mm=(y0_mm, y1_mm), cell_mm=cell_mm)
+    field = MapField(x_mm=(x0_mm, x1_mm), y_mm=(y0_mm, y1_mm), cell_mm=cell_mm)
+    require_field(field, path)
+    return field

@@ -88,6 +88,7 @@ class About(msgspec.Struct, frozen=True, kw_only=True):
             raise ConfigError(f"{path}: what it says about its map cannot be read: {error}") from error
         if about.format != FORMAT:
             raise ConfigError(f"{path}: is of format {about.format}; this version reads format {FORMAT}")
+        require_field(about.field, path)
         return about
 
     def stored(self, cells: Structured, path: Path, layers: dict[str, NDArray[Any]] | None = None) -> StoredMap:
@@ -96,6 +97,22 @@ class About(msgspec.Struct, frozen=True, kw_only=True):
         if digest(found) != self.digest:
             log.warning("%s: its cells are not those that it was written with (digest %s)", path, self.digest)
         return StoredMap(found, self.scan, self.calibration, layers or {})
+
+
+def require_field(field: MapField, path: Path) -> None:
+    """See that a field read from a file is one that a map can have.
+
+    Raises
+    ------
+    ConfigError
+        It has no cells, or more in a row than cells have numbers for.
+    """
+    rows, columns = field.shape
+    most = int(np.iinfo(MAP_CELL["ix"]).max)
+    if not (0 < rows <= most and 0 < columns <= most):
+        raise ConfigError(
+            f"{path}: its field {field.x_mm}, {field.y_mm} of {field.cell_mm} mm has no cells, or too many"
+        )
 
 
 def with_height(found: HybridMap) -> NDArray[np.bool_]:

@@ -297,6 +297,17 @@ def test_a_cloud_that_somebody_edited_is_read_and_said_to_be_edited(
     assert "its cells are not those that it was written with" in caplog.text
 
 
+def test_what_is_known_survives_a_program_that_strips_the_comments(tmp_path: Path) -> None:
+    kept = some_map()
+    notes = tuple("a " * n + "b" for n in range(150, 260, 7))
+    kept = replace(kept, found=replace(kept.found, notes=notes))
+    path = made(tmp_path / "map.ply", kept)
+    read = plyfile.PlyData.read(str(path), mmap=False)
+    stripped = [comment.strip() for comment in read.comments]
+    plyfile.PlyData(read.elements, comments=stripped, byte_order="<").write(str(path))
+    assert formats.read(path).found.notes == notes
+
+
 def test_a_cloud_of_somebody_else_is_refused(tmp_path: Path) -> None:
     points = np.zeros(5, dtype=[("x", "f4"), ("y", "f4"), ("z", "f4")])
     plyfile.PlyData([plyfile.PlyElement.describe(points, "vertex")], byte_order="<").write(str(tmp_path / "theirs.ply"))

@@ -19,6 +19,8 @@ from echolume_processing.hybrid.stored import BLOCK, StoredMap, unmeasured
 STEEPEST = 2.0
 """Rise over run beyond which two cells are the two sides of a step, of which nothing was measured: 63 degrees."""
 SOLID, GLASS = 0, 1
+BEHIND_RGB = (199, 224, 242)
+"""Of what lies behind glass."""
 VERTEX = np.dtype([*((name, ply.VERTEX[name].str) for name in ply.VERTEX.names or ()), ("layer", "u1")])
 
 
@@ -152,4 +154,6 @@ def _vertices(found: HybridMap, sheet: Sheet) -> Generator[Structured]:
         for name in plain.dtype.names or ():
             vertex[name] = plain[name]
         vertex["z"], vertex["layer"] = height_mm[at], behind[at]
+        for name, value in zip(("red", "green", "blue"), BEHIND_RGB, strict=True):
+            vertex[name][behind[at]] = value
         yield vertex

@@ -87,7 +87,7 @@ def header(stored: StoredMap, elements: Sequence[tuple[str, int, np.dtype[np.voi
     """Header of a PLY file with what is known about its map as comments."""
     names = ", ".join(f"{label.value} {label.name.lower()}" for label in Label)
     about = About.of(stored)
-    text = about.text()
+    text = about.text().replace(" ", "\\u0020")  # programs that rewrite a file strip its comments
     lines = [
         "ply",
         "format binary_little_endian 1.0",

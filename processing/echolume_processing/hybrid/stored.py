@@ -70,8 +70,8 @@ class About(msgspec.Struct, frozen=True, kw_only=True):
         )
 
     def text(self) -> str:
-        """One line of ASCII."""
-        return json.dumps(msgspec.to_builtins(self, enc_hook=float))
+        """One line of ASCII, with spaces in its strings only."""
+        return json.dumps(msgspec.to_builtins(self, enc_hook=float), separators=(",", ":"))
 
     @classmethod
     def parse(cls, text: str, path: Path) -> About:

@@ -29,6 +29,8 @@ SUMMARIES = {
     "reprocess": "rebuild the hybrid map from a raw archive",
     "figures": "draw the paper's figures, and those of a scan",
     "image": "acoustic images of a scan, and the volume by delay-and-sum",
+    "export": "write a hybrid map as PLY, LAS, E57, mesh or npz",
+    "evaluate": "score a hybrid map against the truth",
     "localise": "locate a target in recorded echoes of a 1+N array",
 }
 

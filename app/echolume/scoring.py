@@ -47,6 +47,18 @@ def cut(
     ValueError
         If the field is on another raster, or reaches beyond the truth.
     """
+    at = window(front_mm.shape, x0_mm, y0_mm, cell_mm, field)
+    return Truth(front_mm=front_mm[at].astype(np.float64), glass=material[at] == GLASS)
+
+
+def window(shape: tuple[int, ...], x0_mm: float, y0_mm: float, cell_mm: float, field: MapField) -> tuple[slice, slice]:
+    """Rows and columns of a truth of `shape`, with its corner at (x0_mm, y0_mm), that a map's field takes up.
+
+    Raises
+    ------
+    ValueError
+        If the field is on another raster, or reaches beyond the truth.
+    """
     rows, columns = field.shape
     i0, j0 = (field.x_mm[0] - x0_mm) / cell_mm, (field.y_mm[0] - y0_mm) / cell_mm
     if abs(field.cell_mm - cell_mm) > 1e-9 or max(abs(i0 - round(i0)), abs(j0 - round(j0))) > 1e-6:
@@ -54,10 +66,9 @@ def cut(
             f"the map's raster ({field.cell_mm} mm from {field.x_mm[0]}) is not the truth's ({cell_mm} mm)"
         )
     i, j = round(i0), round(j0)
-    if i < 0 or j < 0 or j + rows > front_mm.shape[0] or i + columns > front_mm.shape[1]:
-        raise ValueError(f"the map's field reaches beyond the truth of shape {front_mm.shape}")
-    window = (slice(j, j + rows), slice(i, i + columns))
-    return Truth(front_mm=front_mm[window].astype(np.float64), glass=material[window] == GLASS)
+    if i < 0 or j < 0 or j + rows > shape[0] or i + columns > shape[1]:
+        raise ValueError(f"the map's field reaches beyond the truth of shape {shape}")
+    return slice(j, j + rows), slice(i, i + columns)
 
 
 def away_from_edges(front_mm: NDArray[np.float64], step_mm: float = 1.0) -> NDArray[np.bool_]:

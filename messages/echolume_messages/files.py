@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
 
 from echolume_messages.errors import ConfigError
@@ -68,12 +70,26 @@ def replace_bytes(path: Path, data: bytes) -> None:
     OSError
         As the system says.
     """
+    with replacing(path) as fresh:
+        fresh.write_bytes(data)
+
+
+@contextmanager
+def replacing(path: Path) -> Generator[Path]:
+    """A place beside `path` to write a file to; it takes the place of `path` once it is whole and on the disk.
+
+    What was at `path` stays if the block fails; nothing half written is left.
+
+    Raises
+    ------
+    OSError
+        As the system says.
+    """
     fresh = path.with_name(f".{path.name}.{os.getpid()}.new")
     try:
-        with fresh.open("wb") as sink:
-            sink.write(data)
-            sink.flush()
-            os.fsync(sink.fileno())
+        yield fresh
+        with fresh.open("rb") as written:
+            os.fsync(written.fileno())
         fresh.replace(path)
     finally:
         fresh.unlink(missing_ok=True)

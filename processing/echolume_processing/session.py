@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TypedDict
 
 import numpy as np
+from numpy.typing import NDArray
 
 from echolume_messages import archive as archives
 from echolume_messages import topics
@@ -16,11 +17,13 @@ from echolume_messages.errors import ArchiveError, CalibrationError, Calibration
 from echolume_messages.files import make_folder
 from echolume_processing import figures
 from echolume_processing.evidence import Evidence, ScanStart, read_start
+from echolume_processing.export import npz
 from echolume_processing.hybrid import ply, recording
 from echolume_processing.hybrid.baselines import Baselines, baselines
 from echolume_processing.hybrid.digest import digest
 from echolume_processing.hybrid.fuse import fuse
 from echolume_processing.hybrid.model import HybridMap
+from echolume_processing.hybrid.stored import StoredMap
 from echolume_processing.optical.pipeline import OpticalPipeline
 from echolume_processing.ping import ping_from_record
 from echolume_processing.review import REPORTS
@@ -131,8 +134,9 @@ def conclude(evidence: Evidence, out: Path, progress: Progress = silent) -> tupl
     found = fuse(optical, evidence.all_pings(), evidence.calibration, evidence.plan.map)
     others = baselines(optical, ultrasonic, evidence.plan.map)
     progress("writing", 1, 3)
-    ply.write(found, out / "hybrid.ply")
-    save_maps(found, others, out / "map.npz")
+    calibration = evidence.calibration.digest
+    ply.write(found, out / "hybrid.ply", evidence.scan, calibration)
+    npz.write(StoredMap(found, evidence.scan, calibration, layers_of(others)), out / "map.npz")
     recording.write(evidence, found, out / "hybrid.rrd")
     progress("drawing", 2, 3)
     drawn = figures.draw(optical, ultrasonic, found, others, out / "figures")
@@ -155,22 +159,13 @@ def conclude(evidence: Evidence, out: Path, progress: Progress = silent) -> tupl
     return found, results
 
 
-def save_maps(found: HybridMap, others: Baselines, path: Path) -> None:
-    """Every field of the hybrid map and the baselines' heights as images, in one ``.npz``."""
-    names = [n for n in found.cells.dtype.names or () if n not in ("ix", "iy")]
-    fields = {name: found.image(name) for name in names}
-    with path.open("wb") as stream:
-        np.savez(
-            stream,
-            allow_pickle=False,
-            **fields,
-            optical_mm=others.optical_mm.astype(np.float32),
-            ultrasonic_mm=others.ultrasonic_mm.astype(np.float32),
-            union_mm=others.union_mm.astype(np.float32),
-            x_mm=np.array(found.field.x_mm),
-            y_mm=np.array(found.field.y_mm),
-            cell_mm=np.array(found.field.cell_mm),
-        )
+def layers_of(others: Baselines) -> dict[str, NDArray[np.float32]]:
+    """The baselines' heights, as the map's file holds them beside its own."""
+    return {
+        "optical_mm": others.optical_mm.astype(np.float32),
+        "ultrasonic_mm": others.ultrasonic_mm.astype(np.float32),
+        "union_mm": others.union_mm.astype(np.float32),
+    }
 
 
 def _guide_x_mm(left: Message) -> float:

@@ -1,0 +1,1 @@
+"""The hybrid map in the formats of other programs, and back."""

@@ -826,9 +826,11 @@ def veil(
     rows, columns = rays.shape[0], rays.shape[1]
     out = np.zeros((rows, columns), dtype=np.float32)
     spot, way = np.empty(3), np.empty(3)
+    free = True
     eye_off = plane[3] - (plane[0] * eye[0] + plane[1] * eye[1] + plane[2] * eye[2])
     sheet_mm = line_mm * math.sqrt(2.0 * math.pi)
     for row in range(rows):
+        free_column = -4
         for column in range(columns):
             a, b = rays[row, column, 0], rays[row, column, 1]
             for k in range(3):
@@ -844,8 +846,12 @@ def veil(
             left = (head[2] - spot[2]) / head[2]
             if not fan[0] * left < spot[1] - head[1] * (1 - left) < fan[1] * left:
                 continue
-            if spot[2] < top_mm and not _clear(ground, glass, grid, spot, head, eye, top_mm):
-                continue
+            if spot[2] < top_mm:
+                # what is in the way changes slowly, and the veil is faint
+                if column - free_column >= 4:
+                    free, free_column = _clear(ground, glass, grid, spot, head, eye, top_mm), column
+                if not free:
+                    continue
             l_mm = math.sqrt((head[0] - spot[0]) ** 2 + (head[1] - spot[1]) ** 2 + (head[2] - spot[2]) ** 2)
             length = math.sqrt(way[0] ** 2 + way[1] ** 2 + way[2] ** 2)
             cosine = abs(towards) / length

@@ -22,7 +22,7 @@ from echolume_drivers.emulated.flaws import ROOMS
 from echolume_drivers.emulated.grbl_peer import GrblPeer
 from echolume_drivers.emulated.optics import OpticalTruth, Side, optical_truth
 from echolume_drivers.emulated.robot_peer import RobotPeer
-from echolume_drivers.emulated.scene import SCENES
+from echolume_drivers.emulated.scene import named
 from echolume_drivers.emulated.stage import Stage
 from echolume_drivers.emulated.stripe_image import render_stripe
 from echolume_drivers.emulated.trigger_peer import TriggerPeer
@@ -68,7 +68,7 @@ class EmulatedRig:
     seed
         Draws the rig's true build and its noise.
     scene_name
-        What stands on the bench at first, see `scene.SCENES`.
+        What stands on the bench at first: a name of `scene.SCENES`, or a scene file.
     speed
         How much faster than real the axes move and dwell; deadlines and time stamps stay real.
     pulse
@@ -92,14 +92,12 @@ class EmulatedRig:
         bare: bool = False,
         room: Room = "dark",
     ) -> None:
-        if scene_name not in SCENES:
-            raise ConfigError(f"emulated rig: unknown scene {scene_name!r}; known: {', '.join(SCENES)}")
         if not 0 < speed <= FASTEST:
             raise ConfigError(f"emulated rig: speed must be above 0 and at most {FASTEST:g}, got {speed}")
         if seed < 0:
             raise ConfigError(f"emulated rig: seed must not be below 0, got {seed}")
         self._directory = directory.resolve()
-        self._stage = Stage(seed, SCENES[scene_name](), speed)
+        self._stage = Stage(seed, named(scene_name), speed)
         self._seed = seed
         self._poses = board_poses(seed)
         self._truth = optical_truth(seed, ROOMS[room])
@@ -220,9 +218,11 @@ class EmulatedRig:
     def _place(self, request: Json) -> Json:
         match request:
             case {"scene": str(name)}:
-                if name not in SCENES:
-                    raise ValueError(f"unknown scene {name!r}; known: {', '.join(SCENES)}")
-                self._stage.place(scene=SCENES[name]())
+                try:
+                    scene = named(name)
+                except ConfigError as error:
+                    raise ValueError(str(error)) from error
+                self._stage.place(scene=scene)
             case {"board": int(index)} if not isinstance(index, bool):
                 if not 0 <= index < len(self._poses):
                     raise ValueError(f"board pose {index} is not among 0..{len(self._poses) - 1}")
@@ -233,7 +233,7 @@ class EmulatedRig:
                     raise ValueError("board is no rigid 4x4 matrix")
                 self._stage.place(board=board_at(pose))
             case _:
-                raise ValueError("give scene (a name) or board (an index or a 4x4 matrix)")
+                raise ValueError("give scene (a name or a file) or board (an index or a 4x4 matrix)")
         return {}
 
     def _write_truth(self, request: Json) -> Json:
@@ -248,6 +248,9 @@ class EmulatedRig:
                 x0_mm=scene.x0_mm,
                 y0_mm=scene.y0_mm,
                 cell_mm=scene.cell_mm,
+                region=scene.region_image,
+                regions=np.array(scene.regions),
+                expect=np.array(msgspec.json.encode(scene.expect).decode()),
             )
         return {"path": str(path), "scene": scene.name}
 

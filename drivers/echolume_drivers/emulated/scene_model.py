@@ -110,6 +110,8 @@ class Scene:
     front_mm: NDArray[np.float64]
     optical_mm: NDArray[np.float64]
     material: NDArray[np.uint8]
+    optical_material: NDArray[np.uint8] | None = None
+    """Of what light meets; None: `material`, where glass lies over matte things."""
     front_slope: NDArray[np.float64] | None = None
     """dz/dx and dz/dy within each cell of the front, shape (rows, columns, 2); None: all level."""
     optical_slope: NDArray[np.float64] | None = None
@@ -152,6 +154,11 @@ class Scene:
     def bends_light(self) -> bool:
         """Whether any glass is thick enough to be told from a thin one."""
         return self.glass_mm is not None and bool(np.any(self.glass_mm > 0))
+
+    @property
+    def lit_material(self) -> NDArray[np.uint8]:
+        """Material of what light meets, as the renderer has it: `Material.GLASS` is matte behind glass."""
+        return self.material if self.optical_material is None else self.optical_material
 
     @property
     def region_image(self) -> NDArray[np.uint8]:

@@ -57,7 +57,7 @@ class SceneBuilder:
         self._front_slope, self._optical_slope = np.zeros((n, n, 2)), np.zeros((n, n, 2))
         self._underside = np.full((n, n), SOLID)
         self._glass = np.zeros((n, n))
-        self._material, self._panes, self._region = (np.zeros((n, n), dtype=np.uint8) for _ in range(3))
+        self._material, self._lit, self._panes, self._region = (np.zeros((n, n), dtype=np.uint8) for _ in range(4))
         at_mm = -self.half_mm + (np.arange(n) + 0.5) * self.cell_mm
         self.x_mm, self.y_mm = np.meshgrid(at_mm, at_mm)
         """Centres of the cells."""
@@ -106,9 +106,11 @@ class SceneBuilder:
             over = (self._panes[where] > 0) & (self._front[where] <= underside)
             self._panes[where] = np.where(over, self._panes[where] + 1, 1)
             self._glass[where] = np.where(over, self._glass[where], 0.0) + body.thickness_mm
+            self._lit[where & (self._lit == Material.MATTE)] = Material.GLASS
         else:
             self._optical[where], self._optical_slope[where] = top, slope
             self._panes[where], self._glass[where] = 0, 0.0
+            self._lit[where] = body.material
         self._front[where], self._front_slope[where] = top, slope
         self._underside[where], self._material[where] = underside, body.material
         return self
@@ -130,6 +132,7 @@ class SceneBuilder:
             self._front,
             self._optical,
             self._material,
+            optical_material=self._lit if np.any(self._lit != self._material) else None,
             front_slope=self._front_slope if np.any(self._front_slope) else None,
             optical_slope=self._optical_slope if np.any(self._optical_slope) else None,
             underside_mm=self._underside if np.any(np.isfinite(self._underside)) else None,

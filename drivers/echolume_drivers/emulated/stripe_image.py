@@ -121,7 +121,7 @@ def _direct(
     """Spans (n, 6) of the cut where the light lands, their kinds (n, 3), images (n, 4) and brightness (n,)."""
     camera = truth.camera(side)
     relief_mm = shape.top_mm - min(0.0, float(scene.optical_mm.min()))
-    spans, kinds = cut(scene.light_ground, scene.material, shape.grid, shape.plane, _FAN_MM, _PER_MM, relief_mm)
+    spans, kinds = cut(scene.light_ground, scene.lit_material, shape.grid, shape.plane, _FAN_MM, _PER_MM, relief_mm)
     brightness = light(
         scene.light_ground, scene.glass, shape.grid, spans, kinds,
         shape.head, camera.centre_mm, SURFACES, TRANSMISSION, shape.top_mm,
@@ -153,18 +153,19 @@ def _astray(
 ) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:  # fmt: skip
     """Images (n, 4) and brightness (n,) of glint, of second stripes, and of what mirrors make of the stripe."""
     flaws, camera = truth.flaws, truth.camera(side)
-    field = (scene.light_ground, scene.glass, scene.material, shape.grid)
+    field = (scene.light_ground, scene.glass, scene.lit_material, shape.grid)
     rays = (shape.head, camera.centre_mm)
     found: list[tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]] = []
     if flaws.glint > 0 or flaws.glass_haze > 0:
         glass = np.array([flaws.glass_haze, flaws.glint * GLASS_MIRROR[0], GLASS_MIRROR[1]])
         edges = flaws.glint * WORN_EDGES
-        found.append(glints(*field, shape.plane, *rays, edges, glass, shape.line_mm, shape.top_mm))
+        front = (scene.light_ground, scene.glass, scene.material, shape.grid)
+        found.append(glints(*front, shape.plane, *rays, edges, glass, shape.line_mm, shape.top_mm))
     if flaws.secondary > 0 or flaws.sheen > 0:
         albedo = SURFACES[:, 0]
         walls = np.stack([albedo, albedo * flaws.secondary * SCENE_ALBEDO, MIRRORS * flaws.sheen], axis=1)
         found.append(second_stripes(*field, spans, kinds, *rays, walls, shape.line_mm, shape.top_mm))
-    if np.any(scene.material == Material.MIRROR):
+    if np.any(scene.lit_material == Material.MIRROR):
         albedo = MIRROR_REFLECTANCE * SURFACES[:, 0]
         found.append(thrown(*field, spans, kinds, *rays, albedo, shape.line_mm, shape.top_mm))
         shine = MIRROR_REFLECTANCE * brightness
@@ -177,7 +178,7 @@ def _astray(
 
 def _mirror_planes(scene: Scene) -> NDArray[np.float64]:
     """Planes n.X = c of the scene's mirrors, shape (m, 4); a curved one shows nothing."""
-    y, x = np.nonzero(scene.material == Material.MIRROR)
+    y, x = np.nonzero(scene.lit_material == Material.MIRROR)
     planes = scene.light_ground[y, x]
     x_mm, y_mm = scene.x0_mm + (x + 0.5) * scene.cell_mm, scene.y0_mm + (y + 0.5) * scene.cell_mm
     foot_mm = planes[:, 0] - planes[:, 1] * x_mm - planes[:, 2] * y_mm

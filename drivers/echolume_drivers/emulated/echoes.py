@@ -121,9 +121,7 @@ def echo_waveforms(
         scene.front_mm, surface.near, surface.dilated, origin_mm, scene.cell_mm, *waves,
     )  # fmt: skip
     if len(facets.tilted):
-        accumulate_tilted(
-            facets.tilted, surface.tilted_texture, scene.front_mm, origin_mm, scene.cell_mm, *waves
-        )
+        accumulate_tilted(facets.tilted, surface.tilted_texture, scene.front_mm, origin_mm, scene.cell_mm, *waves)
     f_hz = _frequencies_hz(array)
     weights = transducer.band_weights(f_hz, bands_hz)
     # mean loss of spreading each delta over two bins

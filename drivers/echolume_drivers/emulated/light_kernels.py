@@ -417,10 +417,7 @@ def _bevel(sx: float, sy: float, x: float, y: float, z: float, head: Floats, eye
 def _clear(
     ground: Floats, glass: Floats, grid: Floats, start: Floats, head: Floats, eye: Floats, top_mm: float
 ) -> bool:
-    return (
-        trace(ground, glass, grid, start, head, top_mm) >= 0
-        and trace(ground, glass, grid, start, eye, top_mm) >= 0
-    )
+    return trace(ground, glass, grid, start, head, top_mm) >= 0 and trace(ground, glass, grid, start, eye, top_mm) >= 0
 
 
 @numba.njit(cache=True, nogil=True)

@@ -24,6 +24,10 @@ BEFORE = Path(__file__).parent / "data" / "four_scenes.npz"
 POSES = {"wideband": (-50, -40, 150, 0, 0, 0), "paper": (40, -50, 120, 0.1, -0.1, 0)}
 
 
+EXPECT = '[[expect]]\nregion = "{}"\nmay = ["{}"]\n'
+HEIGHTS = '[[piece]]\nkind = "heights"\nfile = "{}"\ncorner_mm = [0.0, 0.0]\n'
+
+
 def built(text: str) -> Scene:
     return scene_file.build(scene_file.parse('name = "x"\n' + text))
 
@@ -160,8 +164,8 @@ class TestShapes:
         assert away.max() < 20
         np.testing.assert_allclose(scene.front_mm[j, i], 12 + np.sqrt(400 - away**2), atol=1e-9)
         for along, axis in (("x", 0), ("y", 1)):
-            text = f'[[piece]]\nkind = "cylinder"\nx_mm = 0.0\ny_mm = 0.0\nradius_mm = 15.0\nlength_mm = 60.0\nalong = "{along}"\n'
-            lying = built(text).front_mm
+            text = '[[piece]]\nkind = "cylinder"\nx_mm = 0.0\ny_mm = 0.0\nradius_mm = 15.0\nlength_mm = 60.0\n'
+            lying = built(f'{text}along = "{along}"\n').front_mm
             j, i = np.nonzero(lying)
             across = (j if axis == 0 else i) - 119.5
             np.testing.assert_allclose(lying[j, i], np.sqrt(225 - across**2), atol=1e-9)
@@ -169,7 +173,8 @@ class TestShapes:
 
     def test_a_stair_and_a_wedge_run_along_their_axis(self) -> None:
         stair = built(
-            '[[piece]]\nkind = "stair"\nx_mm = [-10.0, 10.0]\ny_mm = [-20.0, 20.0]\nsteps_mm = [3.0, 6.0]\nalong = "y"\n'
+            '[[piece]]\nkind = "stair"\nx_mm = [-10.0, 10.0]\ny_mm = [-20.0, 20.0]\n'
+            'steps_mm = [3.0, 6.0]\nalong = "y"\n'
         )
         assert set(stair.front_mm[100:120, 110:130].ravel()) == {3.0}
         assert set(stair.front_mm[120:140, 110:130].ravel()) == {6.0}
@@ -219,16 +224,16 @@ class TestShapes:
         (box() + box().replace("z_mm = 5.0", "z_mm = 2.0"), r"up to 3 mm below .* - at `\$\.piece\[1\]`"),
         (box().replace("-20.0, 20.0", "20.0, -20.0"), r"x_mm runs from 20 to -20 - at `\$\.piece\[0\]`"),
         (box().replace("-20.0, 20.0", "500.0, 600.0"), r"covers no cell .* - at `\$\.piece\[0\]`"),
-        (box('[[expect]]\nregion = "c"\nmay = ["matte"]\n'), r"no region 'c'; known: elsewhere, b - at `\$\.expect\[0\]"),
-        (box('[[expect]]\nregion = "b"\nmay = ["free"]\n'), r"'free' - at `\$\.expect\[0\]\.may\[0\]`"),
-        (box('[[expect]]\nregion = "b"\nmay = ["matte"]\nat_least = 2.0\n'), r"<= 1.0 - at `\$\.expect\[0\]\.at_least`"),
+        (box(EXPECT.format("c", "matte")), r"no region 'c'; known: elsewhere, b - at `\$\.expect\[0\]"),
+        (box(EXPECT.format("b", "free")), r"'free' - at `\$\.expect\[0\]\.may\[0\]`"),
+        (box(EXPECT.format("b", "matte") + "at_least = 2.0\n"), r"<= 1.0 - at `\$\.expect\[0\]\.at_least`"),
         ("[air]\nsmoke_per_m = -1.0\n", r">= 0.0 - at `\$\.air\.smoke_per_m`"),
         ('room = "green"\n', r"'green' - at `\$\.room`"),
-        ('[[piece]]\nkind = "heights"\nfile = "no.npz"\ncorner_mm = [0.0, 0.0]\n', r"no.npz: cannot read .* `\$\.piece\[0\]`"),
-        ('[[piece]]\nkind = "heights"\nfile = "no.png"\ncorner_mm = [0.0, 0.0]\n', r"no.png: expected finite .*piece\[0\]"),
+        (HEIGHTS.format("no.npz"), r"no.npz: cannot read .* `\$\.piece\[0\]`"),
+        (HEIGHTS.format("no.png"), r"no.png: expected finite .*piece\[0\]"),
         ("pieces = [\n", r"Invalid TOML|[Ii]nvalid|Unclosed|Expected"),
     ],
-)  # fmt: skip
+)
 def test_a_wrong_file_is_refused_with_its_name_and_the_place_in_it(text: str, complaint: str, tmp_path: Path) -> None:
     path = tmp_path / "wrong.toml"
     path.write_text('name = "wrong"\n' + text)

@@ -73,7 +73,7 @@ def test_glass_bends_light_as_snell_says(side: str, tilt_deg: tuple[float, float
             aim = np.array([(offset_mm - plane_y * y_mm) / plane_x, y_mm, 0.0])
             return to_bench(*traced(head, aim - head, normal, 4.0))
 
-        y_mm = least_squares(lambda v: [lit(v[0])[1] - spot[1]], [spot[1]]).x[0]
+        y_mm = least_squares(lambda v, goal_mm=spot[1]: [lit(v[0])[1] - goal_mm], [spot[1]]).x[0]
         np.testing.assert_allclose(spot, lit(y_mm), atol=0.004)
         np.testing.assert_allclose(seen_at[:2], spot[:2], atol=0.008)
     assert plane_z != 0

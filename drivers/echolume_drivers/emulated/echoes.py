@@ -94,7 +94,8 @@ def echo_waveforms(
     Notes
     -----
     Kirchhoff approximation with soft shadows and one floor-wall double bounce; no wall-wall bounces, none between
-    tilted surfaces, nothing below an overhang, and no echo between array and bench. Echoes after the record's end are lost, as in the device.
+    tilted surfaces, nothing below an overhang, and no echo between array and bench. Echoes after the record's end
+    are lost, as in the device.
     """
     require_shape("rig_from_array", rig_from_array, (4, 4))
     surface = surface_of(scene)

@@ -82,10 +82,11 @@ def judge(
     for expected in expect:
         if expected.region not in regions:
             raise ValueError(f"expect: no region {expected.region!r}; known: {', '.join(regions)}")
-        inside = region == regions.index(expected.region)
+        inside = np.asarray(region == regions.index(expected.region), dtype=np.bool_)
         margin = round(expected.margin_mm / cell_mm)
         if margin > 0:
-            inside = binary_erosion(inside, np.ones((3, 3)), iterations=margin, border_value=1)
+            shrunk = binary_erosion(inside, np.ones((3, 3)), iterations=margin, border_value=1)
+            inside = np.asarray(shrunk, dtype=np.bool_)
         found.extend(_of_region(expected, label[inside], front_mm[inside], top_mm[inside], behind_mm[inside]))
     return found
 

@@ -107,9 +107,9 @@ def march(
             here = ground[iy, ix]
             lean_mm = here[RISE_X] * off_x + here[RISE_Y] * off_y
             lean_end_mm = here[RISE_X] * end_x + here[RISE_Y] * end_y
-            if z < here[HEIGHT] + lean_mm - 1e-6 or z_end < here[HEIGHT] + lean_end_mm - 1e-6:
-                if here[UNDER] == -math.inf or z_end > here[UNDER] + lean_end_mm + 1e-6:
-                    return -1
+            below = z < here[HEIGHT] + lean_mm - 1e-6 or z_end < here[HEIGHT] + lean_end_mm - 1e-6
+            if below and (here[UNDER] == -math.inf or z_end > here[UNDER] + lean_end_mm + 1e-6):
+                return -1
             pane = glass[iy, ix]
             in_glass = False
             if pane[PANES] > 0.0:
@@ -444,8 +444,8 @@ def glints(
 ) -> tuple[Floats, Floats, Floats]:
     """What shines where the laser meets worn edges and the glass's own surface.
 
-    `edge` is the strength of a worn edge by material, `shines` is the glass's haze, mirror strength and its exponent, `line_mm`
-    the standard deviation of the laser line's width.
+    `edge` is the strength of a worn edge by material, `shines` is the glass's haze, mirror strength and its exponent,
+    `line_mm` the standard deviation of the laser line's width.
 
     Returns
     -------
@@ -530,10 +530,9 @@ def _wall(ground: Floats, grid: Floats, x: float, iy: int, z: float, side: int) 
     for k in range(1, math.ceil(REACH_MM / grid[2]) + 1):
         ix = here + side * k
         rise = height_at(ground, ix, iy) - z
-        if _tilts(ground, ix, iy) or _tilts(ground, ix - side, iy):
-            # a slope is no wall
-            if -_drop(ground, grid[2], ix - side, iy, side, 0) < STEP_MM:
-                continue
+        sloping = _tilts(ground, ix, iy) or _tilts(ground, ix - side, iy)
+        if sloping and -_drop(ground, grid[2], ix - side, iy, side, 0) < STEP_MM:
+            continue
         if 0 <= ix < ground.shape[1] and 0 <= iy < ground.shape[0] and ground[iy, ix, UNDER] > z + STEP_MM:
             continue
         if rise > STEP_MM:

@@ -1,4 +1,4 @@
-"""Scene files (TOML): pieces on the bench in their order, the air, the room, and what a map must say; docs/scenes.md."""
+"""Scene files (TOML): pieces on the bench in their order, air, room, and what a map must say; see docs/scenes.md."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from echolume_drivers.emulated import shapes
 from echolume_drivers.emulated.scene_model import (
     CLEAR_AIR,
-    ELSEWHERE,
     Air,
     Expectation,
     Finite,
@@ -37,6 +36,8 @@ Tilt = Annotated[float, msgspec.Meta(ge=-60.0, le=60.0)]
 PIECES_LIMIT, HOLES_LIMIT = 200, 200
 HALF_LIMIT_MM = 300.0
 SINKS_MM = 1e-6
+PACKAGE = "echolume_drivers.emulated"
+"""Holds the shipped scenes in its folder ``scenes``."""
 
 
 class Hole(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
@@ -213,13 +214,13 @@ def load(path: Path) -> Scene:
 
 def shipped_names() -> tuple[str, ...]:
     """Names of the scenes that ship with the program."""
-    found = files(__package__).joinpath("scenes").iterdir()
+    found = files(PACKAGE).joinpath("scenes").iterdir()
     return tuple(sorted(entry.name.removesuffix(".toml") for entry in found if entry.name.endswith(".toml")))
 
 
 def shipped(name: str) -> SceneFile:
     """A scene that ships with the program, as it is written."""
-    path = files(__package__).joinpath("scenes", f"{name}.toml")
+    path = files(PACKAGE).joinpath("scenes", f"{name}.toml")
     return parse(path.read_text(encoding="utf-8"), f"{name}.toml")
 
 

@@ -1,4 +1,4 @@
-"""What a scene of the emulated rig is: heights of two layers, their slopes, materials, air, room, and what must be said.
+"""What a scene of the emulated rig is: heights of two layers, slopes, materials, air, room, and what must be said.
 
 Heights lie on millimetre cells in the rig frame; a cell is a small plane, so a tilted plate is flat and not a stair.
 """

@@ -58,9 +58,10 @@ class SceneBuilder:
         self._underside = np.full((n, n), SOLID)
         self._glass = np.zeros((n, n))
         self._material, self._lit, self._panes, self._region = (np.zeros((n, n), dtype=np.uint8) for _ in range(4))
-        at_mm = -self.half_mm + (np.arange(n) + 0.5) * self.cell_mm
-        self.x_mm, self.y_mm = np.meshgrid(at_mm, at_mm)
-        """Centres of the cells."""
+        at_mm = np.asarray(-self.half_mm + (np.arange(n) + 0.5) * self.cell_mm, dtype=np.float64)
+        self.x_mm: Image = np.tile(at_mm, (n, 1))
+        """Centres of the cells, as `y_mm`."""
+        self.y_mm: Image = np.ascontiguousarray(self.x_mm.T)
 
     def rectangle(self, x_mm: tuple[float, float], y_mm: tuple[float, float]) -> Mask:
         """Cells of a rectangle; its sides go to the nearest cells' edges."""

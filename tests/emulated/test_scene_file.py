@@ -247,3 +247,19 @@ def test_a_missing_file_or_name_is_refused_with_what_there_is(tmp_path: Path) ->
         named(str(tmp_path / "no.toml"))
     with pytest.raises(ConfigError, match=r"unknown scene 'moon'; known: .*demo.*smoke.* or a scene file"):
         named("moon")
+
+
+def test_the_page_says_of_every_scene_what_its_file_says() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "scenes.md").read_text(encoding="utf-8")
+    for name in scene_file.shipped_names():
+        d = scene_file.shipped(name)
+        assert f"| {name} | {d.about} | {d.light_sees} | {d.sound_hears} | {d.map_must_say} |" in page
+
+
+def test_the_pages_example_is_a_scene() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "scenes.md").read_text(encoding="utf-8")
+    example = page.split("```toml\n")[1].split("```")[0]
+    scene = scene_file.build(scene_file.parse(example, "scenes.md"), "scenes.md")
+    assert scene.regions == ("elsewhere", "ball", "glass", "glass.holes")
+    for kind in ("box", "plate", "stair", "wedge", "cylinder", "sphere", "heights"):
+        assert f"| `{kind}` |" in page

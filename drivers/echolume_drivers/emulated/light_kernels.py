@@ -70,7 +70,7 @@ def trace(ground: Floats, glass: Floats, grid: Floats, start: Floats, target: Fl
 
     `grid` is (x0_mm, y0_mm, cell_mm); nothing is higher than `top_mm`.
     """
-    return march(ground, glass, grid, start, target, top_mm, 0.0, np.zeros(3))
+    return march(ground, glass, grid, start, target, top_mm, 0.0, start)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -79,6 +79,8 @@ def march(
     raised: Floats,
 ) -> int:  # fmt: skip
     """As `trace`; with a refractive `index`, adds to `raised` (3,) how far the glass seems to raise the start.
+
+    Without an index (0), `raised` is left alone.
 
     A plane plate of thickness t seems to raise what lies behind it along its normal, by
     t (1 - cos a / sqrt(index^2 - sin^2 a)) under the angle a; the way is taken as straight to find a.
@@ -104,23 +106,23 @@ def march(
             xc, yc = x0 + (ix + 0.5) * cell, y0 + (iy + 0.5) * cell
             off_x, off_y = start[0] + t * dx - xc, start[1] + t * dy - yc
             end_x, end_y = start[0] + end * dx - xc, start[1] + end * dy - yc
-            here = ground[iy, ix]
-            lean_mm = here[RISE_X] * off_x + here[RISE_Y] * off_y
-            lean_end_mm = here[RISE_X] * end_x + here[RISE_Y] * end_y
-            below = z < here[HEIGHT] + lean_mm - 1e-6 or z_end < here[HEIGHT] + lean_end_mm - 1e-6
-            if below and (here[UNDER] == -math.inf or z_end > here[UNDER] + lean_end_mm + 1e-6):
-                return -1
-            pane = glass[iy, ix]
+            rise_x, rise_y = ground[iy, ix, RISE_X], ground[iy, ix, RISE_Y]
+            floor = ground[iy, ix, HEIGHT] - 1e-6
+            if z < floor + rise_x * off_x + rise_y * off_y or z_end < floor + rise_x * end_x + rise_y * end_y:
+                under = ground[iy, ix, UNDER]
+                if under == -math.inf or z_end > under + rise_x * end_x + rise_y * end_y + 1e-6:
+                    return -1
             in_glass = False
-            if pane[PANES] > 0.0:
-                low_mm = pane[RISE_X] * off_x + pane[RISE_Y] * off_y
-                in_glass = z < pane[HEIGHT] + low_mm and (
-                    pane[UNDER] == -math.inf or z_end > pane[UNDER] + pane[RISE_X] * end_x + pane[RISE_Y] * end_y
+            if glass[iy, ix, PANES] > 0.0:
+                rise_x, rise_y = glass[iy, ix, RISE_X], glass[iy, ix, RISE_Y]
+                under = glass[iy, ix, UNDER]
+                in_glass = z < glass[iy, ix, HEIGHT] + (rise_x * off_x + rise_y * off_y) and (
+                    under == -math.inf or z_end > under + rise_x * end_x + rise_y * end_y
                 )
             if in_glass and not inside:
-                crossed += int(pane[PANES])
-                if index > 0.0 and pane[THICK] > 0.0:
-                    _raise(pane, dx, dy, dz, index, raised)
+                crossed += int(glass[iy, ix, PANES])
+                if index > 0.0 and glass[iy, ix, THICK] > 0.0:
+                    _raise(glass[iy, ix], dx, dy, dz, index, raised)
             inside = in_glass
         else:
             if z < -1e-6:

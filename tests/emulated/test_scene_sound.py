@@ -206,7 +206,7 @@ def test_steep_glass_returns_no_more_than_its_rim() -> None:
         assert np.abs(records[0]).max() < 0.25 * np.abs(records[1]).max()
 
 
-def test_a_kelvin_moves_every_path_by_0_175_percent() -> None:
+def test_a_kelvin_moves_every_path_by_a_sixth_of_a_percent() -> None:
     pose = looking_down(0.0, 0.0, 150.0)
     plate = SCENES["plate"]()
     cold, warm = (echo_waveforms(plate, pose, ARRAY, TRUTH, t) for t in (19.5, 20.5))

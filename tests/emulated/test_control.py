@@ -7,6 +7,7 @@ import socket
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -14,7 +15,7 @@ from echolume_drivers.cameras import open_camera
 from echolume_drivers.emulated.board_image import board_poses
 from echolume_drivers.emulated.control import Control, ControlServer
 from echolume_drivers.emulated.rig import EmulatedRig
-from echolume_drivers.emulated.scene import SCENES, Material
+from echolume_drivers.emulated.scene import SCENES, Expectation, Material
 from echolume_messages.errors import CommandRefusedError, DeviceSilentError, NoReplyError
 
 
@@ -49,6 +50,24 @@ def test_every_scene_can_be_placed_and_its_truth_written(control: Control, name:
         assert np.array_equal(truth["optical_mm"], expected.optical_mm)
         assert np.array_equal(truth["material"], expected.material)
         assert (truth["x0_mm"], truth["y0_mm"], truth["cell_mm"]) == (-120.0, -120.0, 1.0)
+        assert np.array_equal(truth["region"], expected.region_image)
+        assert tuple(truth["regions"]) == expected.regions
+        said = msgspec.json.decode(str(truth["expect"]), type=list[Expectation])
+        assert tuple(said) == expected.expect
+
+
+def test_a_scene_file_is_placed_and_a_wrong_one_refused(
+    control: Control, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = 'name = "mine"\n[[piece]]\nkind = "box"\nx_mm = [0.0, 9.0]\ny_mm = [0.0, 9.0]\nz_mm = 7.0\n'
+    Path("mine.toml").write_text(text)
+    control.place_scene("mine.toml")
+    assert control.status()["scene"] == "mine"
+    Path("wrong.toml").write_text(text.replace("7.0", '"seven"'))
+    with pytest.raises(CommandRefusedError, match=r"wrong\.toml: Expected `float`.*\$\.piece\[0\]\.z_mm"):
+        control.place_scene("wrong.toml")
+    assert control.status()["scene"] == "mine"
 
 
 def test_the_demos_truth_has_glass_whose_top_light_does_not_see(control: Control, tmp_path: Path) -> None:

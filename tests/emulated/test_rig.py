@@ -18,8 +18,10 @@ import pytest
 from echolume_drivers.array import ArrayDigitiser
 from echolume_drivers.cameras import open_camera
 from echolume_drivers.emulated.control import Control
+from echolume_drivers.emulated.facets import build_facets
 from echolume_drivers.emulated.optics import optical_truth
-from echolume_drivers.emulated.rig import EmulatedRig, toml_text
+from echolume_drivers.emulated.rig import EmulatedRig, something_of_everything, toml_text
+from echolume_drivers.emulated.scene import Material
 from echolume_drivers.emulated.stripe_image import true_stripe
 from echolume_drivers.grbl import GrblGuide
 from echolume_drivers.trigger import TriggerUnit
@@ -130,9 +132,17 @@ def test_a_device_that_fails_to_start_takes_the_others_with_it(tmp_path: Path, m
     assert not rig.rig_file.exists()
 
 
+def test_what_is_compiled_before_the_first_trigger_needs_every_forward_model() -> None:
+    scene = something_of_everything()
+    assert scene.bends_light
+    assert scene.air.smoke_per_m > 0
+    assert np.any(scene.lit_material == Material.MIRROR)
+    assert len(build_facets(scene).tilted)
+
+
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
-    [({"scene_name": "moon"}, r"unknown scene 'moon'; known: demo"), ({"speed": 0.0}, r"speed must be above 0")],
+    [({"scene_name": "moon"}, r"unknown scene 'moon'; known: .*demo"), ({"speed": 0.0}, r"speed must be above 0")],
 )
 def test_wrong_arguments_are_refused(arguments: dict[str, object], complaint: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=complaint):

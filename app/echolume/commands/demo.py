@@ -16,12 +16,14 @@ import sys
 from pathlib import Path
 from types import FrameType
 
+from echolume.scene_option import add_scene_option
+
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     parser.add_argument("--out", type=Path, default=Path("demo-out"), help="folder for the results (default demo-out)")
     parser.add_argument("--seed", type=int, default=1, help="seed of the rig's build and its noise (default 1)")
-    parser.add_argument("--scene", default="demo", help="scene on the bench: demo, matte (default demo)")
+    add_scene_option(parser)
     parser.add_argument(
         "--pulse",
         choices=("wideband", "paper"),

@@ -16,13 +16,15 @@ import threading
 from pathlib import Path
 from types import FrameType
 
+from echolume.scene_option import add_scene_option
+
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     parser.add_argument("--out", type=Path, default=Path("emulated"), help="folder for rig.toml (default emulated)")
     parser.add_argument("--seed", type=int, default=1, help="seed of the rig's build and its noise (default 1)")
     parser.add_argument("--speed", type=float, default=1.0, help="how much faster than real the axes move (default 1)")
-    parser.add_argument("--scene", default="demo", help="what stands on the bench: demo, plate, block, matte")
+    add_scene_option(parser)
     parser.add_argument(
         "--pulse",
         choices=("wideband", "paper"),

@@ -21,7 +21,7 @@ from echolume.results import scan_report, score_maps
 from echolume_daemon.client import ScanClient
 from echolume_drivers.emulated.control import Control
 from echolume_drivers.emulated.rig import FASTEST
-from echolume_drivers.emulated.scene import SCENES
+from echolume_drivers.emulated.scene import named
 from echolume_messages import calibration as calibration_file
 from echolume_messages import plan as plans
 from echolume_messages import rig as rig_file
@@ -104,8 +104,10 @@ def run_demo(settings: DemoSettings, progress: Progress) -> Report:
 
 def _check(settings: DemoSettings, plan: Plan) -> None:
     """Refuse at once what would fail after the calibration only."""
-    if settings.scene not in SCENES:
-        raise ConfigError(f"--scene {settings.scene}: unknown; known: {', '.join(SCENES)}")
+    try:
+        named(settings.scene)
+    except ConfigError as error:
+        raise ConfigError(f"--scene {settings.scene}: {error}") from error
     if not 0 < settings.speed <= FASTEST:
         raise ConfigError(f"--speed {settings.speed:g}: must be above 0 and at most {FASTEST:g}")
     if settings.seed < 0:

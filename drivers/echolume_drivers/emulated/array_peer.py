@@ -156,10 +156,10 @@ class ArrayPeer:
         with self._stage.lock:
             pose = np.asarray(self._stage.robot_pose(), dtype=np.float64)
             scene = self._stage.scene
-            air_c = self._stage.air_temperature_c
+            air_c, felt_c = self._stage.next_air_c()
         rng = self._stage.noise("array", pose)
         echo = simulate_ping(scene, self._truth.rig_from_array(pose), self._settings, self._truth, air_c, rng)
-        self._temperature_c = air_c + self._truth.thermometer_error_k + rng.normal(0, THERMOMETER_SIGMA_K)
+        self._temperature_c = felt_c + self._truth.thermometer_error_k + rng.normal(0, THERMOMETER_SIGMA_K)
         if self._take("dead_channel"):
             echo[self._channel] = 0
         if self._take("over_range"):

@@ -3,7 +3,7 @@
 A request is one line, ``{"op": "place", "scene": "plate"}``; the answer is one line, ``{"ok": true, ...}`` or
 ``{"ok": false, "error": "..."}``. Operations::
 
-    place   scene: a scene's name, or board: the index of a pose, or a 4x4 matrix rig_from_board
+    place   scene: a scene's name or file, or board: the index of a pose, or a 4x4 matrix rig_from_board
     truth   path: where to write what truly stands on the bench, as .npz
     fault   device, fault, and the fault's own arguments (count, delay_s, ...)
     status  laser_on, guide_x_mm, robot_pose, scene, board, frames missed by the cameras
@@ -169,8 +169,8 @@ class Control:
         return answer
 
     def place_scene(self, name: str) -> None:
-        """Put a scene on the bench; the board goes."""
-        self.request("place", scene=name)
+        """Put a scene on the bench, by its name or from a ``.toml`` file; the board goes."""
+        self.request("place", scene=str(Path(name).resolve()) if name.endswith(".toml") else name)
 
     def place_board(self, pose: int | Matrix) -> None:
         """Put the calibration board on the bench, in one of its poses or at ``rig_from_board`` (4, 4)."""
@@ -179,7 +179,8 @@ class Control:
     def truth(self, path: Path) -> Json:
         """Have what truly stands on the bench written to an .npz; returns its path and the scene's name.
 
-        Arrays: front_mm, optical_mm, material (rows along y, columns along x), and x0_mm, y0_mm, cell_mm.
+        Arrays: front_mm, optical_mm, material, region (rows along y, columns along x); x0_mm, y0_mm, cell_mm; regions:
+        the names that region counts; expect: a JSON list of what a map must say of them, see docs/scenes.md.
         """
         return self.request("truth", path=str(path.resolve()))
 

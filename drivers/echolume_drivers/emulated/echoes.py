@@ -11,7 +11,7 @@ from scipy.ndimage import maximum_filter
 from echolume_drivers.emulated import transducer
 from echolume_drivers.emulated.array_truth import ArrayTruth
 from echolume_drivers.emulated.facets import Facets, build_facets
-from echolume_drivers.emulated.kirchhoff import STRIDE, accumulate
+from echolume_drivers.emulated.kirchhoff import STRIDE, accumulate, accumulate_tilted
 from echolume_drivers.emulated.scene import Scene
 from echolume_messages.geometry import Matrix, apply, require_shape, rotation_from_vector
 from echolume_messages.rig import ArraySettings
@@ -40,6 +40,7 @@ class Surface:
     scene: Scene
     facets: Facets
     texture: NDArray[np.float64]  # (m,)
+    tilted_texture: NDArray[np.float64]  # (k,)
     near: NDArray[np.float64]
     dilated: NDArray[np.float64]
 
@@ -51,9 +52,10 @@ def surface_of(scene: Scene) -> Surface:
         return found
     facets = build_facets(scene)
     texture = SCATTER_MM * np.random.default_rng(len(facets.kind)).normal(size=len(facets.kind))
+    tilted_texture = SCATTER_MM * np.random.default_rng([0x71, len(facets.tilted)]).normal(size=len(facets.tilted))
     grown = maximum_filter(scene.front_mm, size=2 * round(DILATION_MM / scene.cell_mm) + 1, mode="constant")
     near = maximum_filter(scene.front_mm, size=2 * STRIDE + 1, mode="constant")
-    found = Surface(scene, facets, texture, near, grown)
+    found = Surface(scene, facets, texture, tilted_texture, near, grown)
     while len(_surfaces) >= _KEPT_SURFACES:
         _surfaces.pop(next(iter(_surfaces)))
     _surfaces[id(scene)] = found
@@ -92,8 +94,9 @@ def echo_waveforms(
 
     Notes
     -----
-    Kirchhoff approximation with soft shadows and one floor-wall double bounce; no wall-wall bounces, and no echo
-    between array and bench. Echoes after the record's end are lost, as in the device.
+    Kirchhoff approximation with soft shadows and one floor-wall double bounce; no wall-wall bounces, none between
+    tilted surfaces, nothing below an overhang, and no echo between array and bench. Echoes after the record's end
+    are lost, as in the device.
     """
     require_shape("rig_from_array", rig_from_array, (4, 4))
     surface = surface_of(scene)
@@ -107,15 +110,20 @@ def echo_waveforms(
     bins = array.samples * OVERSAMPLING
     history = np.zeros((receivers, bins, len(bands_hz)), dtype=np.float32)
     height_mm = max(float(rig_from_array[2, 3]), 1.0)
-    accumulate(
-        facets.centre_mm, facets.kind, facets.sign, facets.size_mm, facets.floor_mm, surface.texture,
-        scene.front_mm, surface.near, surface.dilated, np.array([scene.x0_mm, scene.y0_mm]), scene.cell_mm,
+    origin_mm = np.array([scene.x0_mm, scene.y0_mm])
+    waves = (
         apply(rig_from_array, elements), rig_from_array[:3, 2].copy(),
         transducer.directivity_table(bands_hz, truth.radius_mm, speed_mps),
         2 * np.pi * bands_hz / (speed_mps * 1e3), truth.radius_mm,
         (FADE_FROM_TAN * height_mm, FADE_TO_TAN * height_mm),
         bin_mm, array.start_s * speed_mps * 1e3, history,
     )  # fmt: skip
+    accumulate(
+        facets.centre_mm, facets.kind, facets.sign, facets.size_mm, facets.floor_mm, surface.texture,
+        scene.front_mm, surface.near, surface.dilated, origin_mm, scene.cell_mm, *waves,
+    )  # fmt: skip
+    if len(facets.tilted):
+        accumulate_tilted(facets.tilted, surface.tilted_texture, scene.front_mm, origin_mm, scene.cell_mm, *waves)
     f_hz = _frequencies_hz(array)
     weights = transducer.band_weights(f_hz, bands_hz)
     # mean loss of spreading each delta over two bins
@@ -128,6 +136,8 @@ def echo_waveforms(
     near = _in_time(spectrum * pulses, array.samples)
     t_s = array.start_s + np.arange(array.samples) / array.sample_rate_hz - truth.delays_s[:, None]
     echo = scale * (far + near * 2 / np.maximum(t_s * speed_mps * 1e3, 20.0))
+    if scene.air.sound_db_per_m > 0:
+        echo *= 10 ** (-scene.air.sound_db_per_m / 20 * speed_mps * np.maximum(t_s, 0.0))
     arrival_s = direct_mm[:, None] / (speed_mps * 1e3) - array.start_s
     talk = truth.cross_talk[:, None] * pulses * np.exp(-2j * np.pi * f_hz * arrival_s)
     direct = _in_time(talk, array.samples) if array.start_s == 0 else np.zeros_like(echo)

@@ -279,3 +279,110 @@ def accumulate(
             _deposit(direct[0], image, size_u, size_v, rough, fade, wavenumbers, bin_mm, start_mm, history)
             _deposit(image[0], direct, size_u, size_v, rough, fade, wavenumbers, bin_mm, start_mm, history)
             _deposit(image[0], image, size_u, size_v, rough, fade, wavenumbers, bin_mm, start_mm, history)
+
+
+@njit(cache=True, fastmath={"reassoc", "contract", "arcp", "nsz"})
+def _clearance_above(
+    heights: NDArray[np.float64],
+    x0: float,
+    y0: float,
+    cell: float,
+    top: float,
+    facet: NDArray[np.float64],
+    qx: float,
+    qy: float,
+    qz: float,
+    wavelength: float,
+) -> float:
+    """As `clearance`, from a tilted facet up to q: only what rises above the facet's own plane is in the way."""
+    px, py, pz, rise_x, rise_y = facet[0], facet[1], facet[2], facet[4], facet[5]
+    dx, dy, dz = qx - px, qy - py, qz - pz
+    lateral = math.sqrt(dx * dx + dy * dy)
+    if dz <= 0 or lateral < 0.5 * cell:
+        return 9.0
+    length = math.sqrt(lateral * lateral + dz * dz)
+    least = 9.0
+    steps = int(min(1.0, (top + 4.0 - pz) / dz) * lateral / cell)
+    for k in range(1, steps + 1):
+        t = k * cell / lateral
+        ground = _ground(heights, x0, y0, cell, px + t * dx, py + t * dy)
+        plane = pz + max(0.0, t * (rise_x * dx + rise_y * dy) + cell * (abs(rise_x) + abs(rise_y)))
+        if ground > plane + OBSTACLE_MM:
+            above = (pz + t * dz - ground) * lateral / length
+            least = min(least, above / math.sqrt(wavelength * length * max(t * (1 - t), 1e-3)))
+            if least < DARK:
+                break
+    return least
+
+
+@njit(cache=True, fastmath={"reassoc", "contract", "arcp", "nsz"})
+def _tilted_geometry(
+    facet: NDArray[np.float64],
+    elements: NDArray[np.float64],
+    axis: NDArray[np.float64],
+    radius: float,
+    table: NDArray[np.float32],
+    view: NDArray[np.float64],
+) -> None:
+    """As `_geometry` for a tilted facet; directions, cosine and area are those per area seen from above."""
+    last = table.shape[0] - 1
+    size, rise_x, rise_y = facet[3], facet[4], facet[5]
+    for e in range(elements.shape[0]):
+        dx, dy, dz = elements[e, 0] - facet[0], elements[e, 1] - facet[1], elements[e, 2] - facet[2]
+        d = math.sqrt(dx * dx + dy * dy + dz * dz)
+        u, v = (dx + rise_x * dz) / d, (dy + rise_y * dz) / d
+        ahead = -(dx * axis[0] + dy * axis[1] + dz * axis[2]) / d
+        view[e, WAY] = d
+        view[e, COSINE] = (dz - rise_x * dx - rise_y * dy) / d
+        view[e, LIT] = 1.0 if view[e, COSINE] > 0 and ahead > 0 else 0.0
+        view[e, ALONG_U], view[e, ALONG_V] = u, v
+        flat = size * size * (2 + rise_x * rise_x + rise_y * rise_y - u * u - v * v) / 24.0
+        view[e, SPREAD] = (flat + radius * radius * (1 + ahead * ahead) / 8.0) / d
+        at = max(1.0 - ahead * ahead, 0.0) * last
+        n = min(int(at), last - 1)
+        for b in range(BANDS):
+            view[e, BEAM + b] = table[n, b] + (at - n) * (table[n + 1, b] - table[n, b])
+
+
+@njit(cache=True, fastmath={"reassoc", "contract", "arcp", "nsz"})
+def accumulate_tilted(
+    facets: NDArray[np.float64],
+    texture: NDArray[np.float64],
+    heights: NDArray[np.float64],
+    origin: NDArray[np.float64],
+    cell: float,
+    elements: NDArray[np.float64],
+    axis: NDArray[np.float64],
+    table: NDArray[np.float32],
+    wavenumbers: NDArray[np.float64],
+    radius: float,
+    reach: tuple[float, float],
+    bin_mm: float,
+    start_mm: float,
+    history: NDArray[np.float32],
+) -> None:
+    """As `accumulate` for tilted facets, rows x, y, z, size seen from above, dz/dx, dz/dy; no double bounce."""
+    top = heights.max()
+    wavelength = 2 * math.pi / wavenumbers[BANDS // 2]
+    views = np.empty((elements.shape[0], BEAM + BANDS))
+    for f in range(facets.shape[0]):
+        facet = facets[f]
+        lateral = math.sqrt((facet[0] - elements[0, 0]) ** 2 + (facet[1] - elements[0, 1]) ** 2)
+        if lateral >= reach[1]:
+            continue
+        fade = 1.0
+        if lateral > reach[0]:
+            fade = 0.5 + 0.5 * math.cos(math.pi * (lateral - reach[0]) / (reach[1] - reach[0]))
+        _tilted_geometry(facet, elements, axis, radius, table, views)
+        for e in range(elements.shape[0]):
+            if views[0, LIT] <= 0:
+                break
+            if views[e, LIT] > 0:
+                qx, qy, qz = elements[e, 0], elements[e, 1], elements[e, 2]
+                views[e, LIT] = soft(
+                    _clearance_above(heights, origin[0], origin[1], cell, top, facet, qx, qy, qz, wavelength)
+                )
+        if views[0, LIT] <= 0:
+            continue
+        size = facet[3]
+        _deposit(views[0], views, size, size, texture[f] * size, fade, wavenumbers, bin_mm, start_mm, history)

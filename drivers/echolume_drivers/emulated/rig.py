@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import socket
 import threading
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Literal, Protocol, TypeVar
@@ -22,7 +23,8 @@ from echolume_drivers.emulated.flaws import ROOMS
 from echolume_drivers.emulated.grbl_peer import GrblPeer
 from echolume_drivers.emulated.optics import OpticalTruth, Side, optical_truth
 from echolume_drivers.emulated.robot_peer import RobotPeer
-from echolume_drivers.emulated.scene import SCENES
+from echolume_drivers.emulated.scene import Air, Material, Scene, SceneBuilder, named
+from echolume_drivers.emulated.shapes import Body, plane_through
 from echolume_drivers.emulated.stage import Stage
 from echolume_drivers.emulated.stripe_image import render_stripe
 from echolume_drivers.emulated.trigger_peer import TriggerPeer
@@ -41,6 +43,7 @@ from echolume_messages.rig import (
 
 Pulse = Literal["wideband", "paper"]
 Room = Literal["dark", "bright"]
+SIDES: tuple[Side, Side] = ("left", "right")
 FASTEST = 1e6
 """Beyond this a speed is rather a slip of the pen."""
 
@@ -68,7 +71,7 @@ class EmulatedRig:
     seed
         Draws the rig's true build and its noise.
     scene_name
-        What stands on the bench at first, see `scene.SCENES`.
+        What stands on the bench at first: a name of `scene.SCENES`, or a scene file.
     speed
         How much faster than real the axes move and dwell; deadlines and time stamps stay real.
     pulse
@@ -92,18 +95,17 @@ class EmulatedRig:
         bare: bool = False,
         room: Room = "dark",
     ) -> None:
-        if scene_name not in SCENES:
-            raise ConfigError(f"emulated rig: unknown scene {scene_name!r}; known: {', '.join(SCENES)}")
         if not 0 < speed <= FASTEST:
             raise ConfigError(f"emulated rig: speed must be above 0 and at most {FASTEST:g}, got {speed}")
         if seed < 0:
             raise ConfigError(f"emulated rig: seed must not be below 0, got {seed}")
         self._directory = directory.resolve()
-        self._stage = Stage(seed, SCENES[scene_name](), speed)
+        self._stage = Stage(seed, named(scene_name), speed)
         self._seed = seed
         self._poses = board_poses(seed)
         self._truth = optical_truth(seed, ROOMS[room])
         self._array_settings = ArraySettings(port="", pulse=pulse)
+        self._sound = array_truth(seed, self._array_settings)
         self._bare = bare
         self._rig: Rig | None = None
         self.cameras: dict[Side, CameraPeer] = {}
@@ -152,7 +154,7 @@ class EmulatedRig:
             raise
 
     def _start_devices(self) -> None:
-        sound = array_truth(self._seed, self._array_settings)
+        sound = self._sound
         _warm_up(self._stage, self._truth, self._array_settings, sound)
         guide = self._begin(GrblPeer(self._stage, bare=self._bare))
         robot = self._begin(RobotPeer(self._stage))
@@ -220,9 +222,12 @@ class EmulatedRig:
     def _place(self, request: Json) -> Json:
         match request:
             case {"scene": str(name)}:
-                if name not in SCENES:
-                    raise ValueError(f"unknown scene {name!r}; known: {', '.join(SCENES)}")
-                self._stage.place(scene=SCENES[name]())
+                try:
+                    scene = named(name)
+                except ConfigError as error:
+                    raise ValueError(str(error)) from error
+                _see_and_hear(scene, self._truth, self._array_settings, self._sound)
+                self._stage.place(scene=scene)
             case {"board": int(index)} if not isinstance(index, bool):
                 if not 0 <= index < len(self._poses):
                     raise ValueError(f"board pose {index} is not among 0..{len(self._poses) - 1}")
@@ -233,7 +238,7 @@ class EmulatedRig:
                     raise ValueError("board is no rigid 4x4 matrix")
                 self._stage.place(board=board_at(pose))
             case _:
-                raise ValueError("give scene (a name) or board (an index or a 4x4 matrix)")
+                raise ValueError("give scene (a name or a file) or board (an index or a 4x4 matrix)")
         return {}
 
     def _write_truth(self, request: Json) -> Json:
@@ -248,6 +253,9 @@ class EmulatedRig:
                 x0_mm=scene.x0_mm,
                 y0_mm=scene.y0_mm,
                 cell_mm=scene.cell_mm,
+                region=scene.region_image,
+                regions=np.array(scene.regions),
+                expect=np.array(msgspec.json.encode(scene.expect).decode()),
             )
         return {"path": str(path), "scene": scene.name}
 
@@ -307,10 +315,27 @@ def _warm_up(stage: Stage, optics: OpticalTruth, array: ArraySettings, sound: Ar
     """Compile the forward models and trace the cameras' rays before the first trigger needs them."""
     rng = np.random.default_rng(0)
     board = board_at(np.eye(4))
-    sides: tuple[Side, Side] = ("left", "right")
-    for side in sides:
+    for side in SIDES:
         for laser_on in (True, False):
-            render_stripe(stage.scene, optics, side, 0.0, rng, 1e-3, laser_on)
             render_board(board, optics, side, 0.0, rng, 1e-3, laser_on)
+    for scene in (something_of_everything(), stage.scene):
+        _see_and_hear(scene, optics, array, sound)
+
+
+def _see_and_hear(scene: Scene, optics: OpticalTruth, array: ArraySettings, sound: ArrayTruth) -> None:
+    """Have a scene's facets and planes ready before the first trigger meets it."""
+    rng = np.random.default_rng(0)
+    for side in SIDES:
+        for laser_on in (True, False):
+            render_stripe(scene, optics, side, 0.0, rng, 1e-3, laser_on)
     pose = np.array([0.0, 0.0, 150.0, 0.0, 0.0, 0.0])
-    simulate_ping(stage.scene, sound.rig_from_array(pose), array, sound, stage.air_temperature_c, rng)
+    simulate_ping(scene, sound.rig_from_array(pose), array, sound, 22.0, rng)
+
+
+def something_of_everything() -> Scene:
+    """A scene that needs each forward model: tilted glass, a mirror, smoke."""
+    builder = SceneBuilder("everything")
+    tilted = plane_through(0.0, 0.0, 30.0, (0.1, 0.1))
+    builder.put(Body(builder.rectangle((-20, 20), (-20, 20)), tilted, Material.GLASS, 3.0))
+    builder.box((-20, 20), (20, 40), 5.0, Material.MIRROR)
+    return replace(builder.build(), air=Air(smoke_per_m=0.1))

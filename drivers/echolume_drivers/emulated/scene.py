@@ -1,112 +1,77 @@
-"""The emulated scene: a heightfield of millimetre cells with a material each, in the rig frame."""
+"""The scenes of the emulated rig, by name or from a file."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from enum import IntEnum
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
+from echolume_drivers.emulated import scene_file
+from echolume_drivers.emulated.scene_model import (
+    CLEAR_AIR,
+    ELSEWHERE,
+    Air,
+    Expectation,
+    Material,
+    Scene,
+)
+from echolume_drivers.emulated.shapes import SceneBuilder
+from echolume_messages.errors import ConfigError
+
+__all__ = [
+    "CLEAR_AIR",
+    "ELSEWHERE",
+    "SCENES",
+    "Air",
+    "Expectation",
+    "Material",
+    "Scene",
+    "SceneBuilder",
+    "block",
+    "demo",
+    "matte",
+    "named",
+    "plate",
+]
 
 
-class Material(IntEnum):
-    """What a cell is made of."""
-
-    MATTE = 0
-    BLACK = 1
-    GLASS = 2
-    GLOSSY = 3
+def _shipped(name: str) -> Scene:
+    return scene_file.build(scene_file.shipped(name), f"{name}.toml")
 
 
-@dataclass(frozen=True)
-class Scene:
-    """Heights as sound sees them and as light sees them.
+SCENES: dict[str, Callable[[], Scene]] = {name: partial(_shipped, name) for name in scene_file.shipped_names()}
 
-    ``front_mm[iy, ix]`` is the top of whatever stands there; ``optical_mm`` is what the laser reaches (below
-    glass: what lies behind it). The centre of cell (ix, iy) is (x0_mm + (ix + 0.5) cell_mm, ...). The bench
-    (z = 0) goes on beyond the field.
+
+def named(name: str, folder: Path = Path()) -> Scene:
+    """The scene of a name, or of a file: what ends in ``.toml``, relative to `folder`.
+
+    Raises
+    ------
+    ConfigError
+        There is none of that name, or the file is wrong.
     """
-
-    name: str
-    x0_mm: float
-    y0_mm: float
-    cell_mm: float
-    front_mm: NDArray[np.float64]
-    optical_mm: NDArray[np.float64]
-    material: NDArray[np.uint8]
-
-
-class SceneBuilder:
-    """Puts boxes on a bench."""
-
-    def __init__(self, name: str, half_mm: float = 120.0, cell_mm: float = 1.0) -> None:
-        n = round(2 * half_mm / cell_mm)
-        self._name = name
-        self._origin_mm = -half_mm
-        self._cell_mm = cell_mm
-        self._front = np.zeros((n, n))
-        self._optical = np.zeros((n, n))
-        self._material = np.zeros((n, n), dtype=np.uint8)
-
-    def box(
-        self,
-        x_mm: tuple[float, float],
-        y_mm: tuple[float, float],
-        z_mm: float,
-        material: Material = Material.MATTE,
-    ) -> SceneBuilder:
-        """Put a box with its top at z_mm; through glass the laser goes on to what was there before."""
-        i0, i1 = (round((x - self._origin_mm) / self._cell_mm) for x in x_mm)
-        j0, j1 = (round((y - self._origin_mm) / self._cell_mm) for y in y_mm)
-        cells = (slice(j0, j1), slice(i0, i1))
-        self._front[cells] = z_mm
-        if material is not Material.GLASS:
-            self._optical[cells] = z_mm
-        self._material[cells] = material
-        return self
-
-    def build(self) -> Scene:
-        """The finished scene."""
-        return Scene(
-            self._name,
-            self._origin_mm,
-            self._origin_mm,
-            self._cell_mm,
-            self._front,
-            self._optical,
-            self._material,
-        )
+    if name.endswith(".toml"):
+        return scene_file.load(folder / name)
+    if name not in SCENES:
+        raise ConfigError(f"unknown scene {name!r}; known: {', '.join(SCENES)}, or a scene file NAME.toml")
+    return SCENES[name]()
 
 
 def demo() -> Scene:
     """A stair of 10/20/30/40 mm, bars 20 and 12 mm wide, a glass plate 30 mm above the base, a black block."""
-    scene = SceneBuilder("demo")
-    for k in range(4):
-        scene.box((-90 + 20 * k, -70 + 20 * k), (30, 85), 10.0 * (k + 1))
-    scene.box((25, 45), (30, 85), 20.0)
-    scene.box((65, 77), (30, 85), 20.0)
-    scene.box((-85, -15), (-75, -15), 30.0, Material.GLASS)
-    scene.box((20, 70), (-75, -25), 20.0, Material.BLACK)
-    return scene.build()
+    return SCENES["demo"]()
+
+
+def matte() -> Scene:
+    """The demo's shapes, all matte: nothing may be called transparent."""
+    return SCENES["matte"]()
+
+
+def block() -> Scene:
+    """The calibration block that both senses see: 60 x 44 mm, 25 mm high, off the middle."""
+    return SCENES["block"]()
 
 
 def plate(z_mm: float = 0.0) -> Scene:
     """A matte reference plate over the whole field."""
     return SceneBuilder("plate").box((-120, 120), (-120, 120), z_mm).build()
-
-
-def block() -> Scene:
-    """The calibration block that both senses see: 60 x 44 mm, 25 mm high, off the middle."""
-    return SceneBuilder("block").box((-22, 38), (-16, 28), 25.0).build()
-
-
-def matte() -> Scene:
-    """The demo's shapes, all matte: nothing may be called transparent."""
-    found = demo()
-    return Scene(
-        "matte", found.x0_mm, found.y0_mm, found.cell_mm, found.front_mm, found.front_mm,
-        np.zeros_like(found.material),
-    )  # fmt: skip
-
-
-SCENES = {"demo": demo, "plate": plate, "block": block, "matte": matte}

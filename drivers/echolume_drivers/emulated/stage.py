@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -12,6 +13,8 @@ from numpy.typing import NDArray
 
 from echolume_drivers.emulated.scene import Scene
 
+PING_S = 0.5
+"""What a ping and the way to it take on a real rig; the air's clock goes on by it at each ping, whatever the speed."""
 SCREW_SIGMA_MM = 0.01
 """How far the carriage stands from where the guide's controller believes it."""
 
@@ -43,6 +46,7 @@ class Stage:
     laser_on: bool = False
     robot_pose: Callable[[], NDArray[np.float64]] = lambda: np.zeros(6)
     lock: threading.RLock = field(default_factory=threading.RLock)
+    _pings: int = 0
     _laser_watchers: list[Callable[[bool], None]] = field(default_factory=list[Callable[[bool], None]])
     _attempts: dict[tuple[str, tuple[int, ...]], int] = field(default_factory=dict[tuple[str, tuple[int, ...]], int])
 
@@ -64,6 +68,19 @@ class Stage:
         believed_mm = float(self.guide_x_mm())
         return believed_mm + float(self._drawn("screw", round(1000 * believed_mm)).normal(0, SCREW_SIGMA_MM))
 
+    def next_air_c(self) -> tuple[float, float]:
+        """Temperature of the air at the next ping, and what a thermometer without error and noise has followed to.
+
+        A drifting air drifts from ping to ping, not with the wall's clock, so that a scan can be repeated.
+        """
+        with self.lock:
+            air, seconds = self.scene.air, self._pings * PING_S
+            self._pings += 1
+        start_c = self.air_temperature_c if air.temperature_c is None else air.temperature_c
+        per_s, lag_s = air.drift_k_per_min / 60, air.thermometer_lag_s
+        behind_s = lag_s * (1 - math.exp(-seconds / lag_s)) if lag_s > 0 else 0.0
+        return start_c + per_s * seconds, start_c + per_s * (seconds - behind_s)
+
     def noise(self, device: str, position: NDArray[np.float64]) -> np.random.Generator:
         """Random numbers keyed by (seed, device, position to 1 um, attempt at that position)."""
         spot = tuple(int(v) for v in np.round(np.asarray(position, dtype=np.float64) * 1000))
@@ -82,5 +99,6 @@ class Stage:
         with self.lock:
             if scene is not None:
                 self.scene = scene
+                self._pings = 0
             self.board = board
             self._attempts.clear()

@@ -13,6 +13,7 @@ from comparison.echoes import echoes_rows
 from comparison.imaging import imaging_rows
 from comparison.physics import physics_rows
 from comparison.spiel import spiel_rows
+from threadpoolctl import threadpool_limits
 
 PARTS: Mapping[str, Callable[[], dict[str, float]]] = {
     "physics": physics_rows,
@@ -34,8 +35,9 @@ def main() -> None:
     if unknown:
         parser.error(f"no part {', '.join(unknown)}; there are {', '.join(PARTS)}")
     figures: dict[str, float] = {}
-    for name in arguments.parts or PARTS:
-        figures |= PARTS[name]()
+    with threadpool_limits(1):  # all figures are of one core
+        for name in arguments.parts or PARTS:
+            figures |= PARTS[name]()
     if arguments.json is not None:
         arguments.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
 

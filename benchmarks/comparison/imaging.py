@@ -369,7 +369,8 @@ def pymust_lines() -> None:
 
 def peak_rows() -> dict[str, float]:
     """Growth of a child process that makes the whole volume."""
-    out = subprocess.run([sys.executable, "-c", PEAK], capture_output=True, text=True, check=True).stdout
+    here = Path(__file__).resolve().parents[1]  # where the child finds this package
+    out = subprocess.run([sys.executable, "-c", PEAK], capture_output=True, text=True, check=True, cwd=here).stdout
     gathered, plain, coherent = json.loads(out)
     print(
         f"\nPeak memory of the 128 x 128 x 64 volume, the gated scan included: gather with coherence {gathered:.3f}, "

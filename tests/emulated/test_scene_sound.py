@@ -18,7 +18,7 @@ from echolume_messages.rig import ArraySettings
 
 AIR_C = 22.0
 ARRAY = ArraySettings(port="none")
-TRUTH = dataclasses.replace(array_truth(1, ARRAY), cross_talk=np.zeros(8))
+TRUTH = dataclasses.replace(array_truth(1, ARRAY), cross_talk=np.zeros(8), placement_mm=np.zeros((8, 3)))
 SPEED_MM_PER_S = transducer.speed_of_sound_mps(AIR_C) * 1e3
 
 

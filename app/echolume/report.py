@@ -19,7 +19,8 @@ def verdict(report: Report) -> list[str]:
     """Why the demo failed; empty where it succeeded.
 
     It succeeds only if the ledger closes, every acknowledged record is in the archive, every matched trigger is in the
-    map, and the hybrid map beats each sensor alone on ``f1_at_1mm``.
+    map, the map says of the scene's regions what it must, and the hybrid map beats each sensor alone on ``f1_at_1mm``.
+    Where a region must stay unknown, whoever claims it wins that score, so that it does not count.
     """
     reasons: list[str] = []
     for name, row in cast("dict[str, dict[str, int]]", report["ledger"]).items():
@@ -35,8 +36,14 @@ def verdict(report: Report) -> list[str]:
         f"map: made without {len(triggers)} triggers of pass {name!r} that never reached it"
         for name, triggers in cast("dict[str, list[int]]", report.get("unprocessed", {})).items()
     )
+    said = cast("list[dict[str, Any]]", report.get("expectations", []))
+    reasons.extend(
+        f"map: of {s['region']!r}: {s['what']}: {s['share']:.3f} of {s['cells']} cells, must be {s['at_least']:g}"
+        for s in said
+        if not s["kept"]
+    )
     maps = report.get("maps")
-    if maps:
+    if maps and not any(s["what"] == "must unknown" for s in said):
         hybrid = maps["hybrid"]["f1_at_1mm"]
         reasons.extend(
             f"map: hybrid f1_at_1mm {hybrid:.3f} does not beat {other} alone ({maps[other]['f1_at_1mm']:.3f})"
@@ -95,6 +102,14 @@ def table(report: Report) -> str:
         ]
         lines.append("")
         lines += _table(["map", *columns], [[n, *(r.get(c) for c in columns)] for n, r in report["maps"].items()])
+    if report.get("expectations"):
+        lines.append("")
+        head = ["the map must say", "what", "share", "at least", "cells", "kept"]
+        rows = [
+            [s["region"], s["what"], s["share"], s["at_least"], s["cells"], "yes" if s["kept"] else "NO"]
+            for s in report["expectations"]
+        ]
+        lines += _table(head, rows)
     lines.append("")
     if "timing" in report:
         lines.append(_timing(report["timing"], report["resources"]["peak_pss_mib"]))

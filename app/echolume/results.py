@@ -90,6 +90,38 @@ def _calibration_row(start: Json) -> Json:
     }
 
 
+def judge_map(maps: Path, truth: Path, field_: MapField) -> list[Json]:
+    """What the hybrid map says of the scene's regions beside what it must; empty for a truth without expectations."""
+    from echolume_drivers.emulated.expectations import judge
+    from echolume_drivers.emulated.scene_model import Expectation
+
+    with np.load(truth) as real, np.load(maps) as made:
+        at = scoring.window(
+            real["front_mm"].shape, float(real["x0_mm"]), float(real["y0_mm"]), float(real["cell_mm"]), field_
+        )
+        said = judge(
+            msgspec.json.decode(str(real["expect"]), type=list[Expectation]),
+            [str(name) for name in real["regions"]],
+            real["region"][at],
+            made["label"],
+            made["front_mm"],
+            real["front_mm"][at],
+            real["optical_mm"][at],
+            float(real["cell_mm"]),
+        )
+    return [
+        {
+            "region": s.region,
+            "what": s.what,
+            "share": s.share,
+            "at_least": s.at_least,
+            "cells": s.cells,
+            "kept": bool(s.kept),
+        }
+        for s in said
+    ]
+
+
 def score_maps(maps: Path, truth: Path, field_: MapField) -> dict[str, scoring.Scores]:
     """Scores of the hybrid map and its baselines against the emulated rig's truth.
 

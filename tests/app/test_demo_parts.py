@@ -125,3 +125,21 @@ def test_a_child_that_ends_is_named_with_its_log(tmp_path: Path) -> None:
 def test_pss_of_this_process_is_known_and_of_none_is_zero() -> None:
     assert pss_kib(os.getpid()) > 1000
     assert pss_kib(2**22 + 1) == 0
+
+
+def said(**changed: Any) -> dict[str, Any]:
+    return {"region": "glass", "what": "labels", "share": 1.0, "at_least": 0.9, "cells": 10, "kept": True, **changed}
+
+
+def test_a_map_that_does_not_say_what_it_must_fails() -> None:
+    found = {**report(), "expectations": [said(), said(what="must transparent", share=0.4, kept=False)]}
+    assert [r for r in verdict(found) if "glass" in r] == [
+        "map: of 'glass': must transparent: 0.400 of 10 cells, must be 0.9"
+    ]
+    assert "must transparent" in table(found)
+
+
+def test_where_a_region_must_stay_unknown_no_sensor_wins_by_claiming_it() -> None:
+    found = {**report(), "expectations": [said(what="must unknown")]}
+    found["maps"]["hybrid"]["f1_at_1mm"] = 0.5
+    assert verdict(found) == []

@@ -17,7 +17,7 @@ from echolume.demo.timing import Passes
 from echolume.processes import ProcessEndedError, ProcessTree
 from echolume.progress import Progress
 from echolume.report import Report, write
-from echolume.results import scan_report, score_maps
+from echolume.results import judge_map, scan_report, score_maps
 from echolume_daemon.client import ScanClient
 from echolume_drivers.emulated.control import Control
 from echolume_drivers.emulated.rig import FASTEST
@@ -33,7 +33,8 @@ from echolume_messages.files import make_folder, read_text
 from echolume_messages.plan import Plan
 from echolume_messages.rig import Rig
 
-START_TIMEOUT_S = 90.0
+START_TIMEOUT_S = 300.0
+"""The first start of an installation compiles all kernels, on a small machine for minutes."""
 MAP_TIMEOUT_S = 240.0
 
 Json = dict[str, Any]
@@ -74,7 +75,9 @@ def run_demo(settings: DemoSettings, progress: Progress) -> Report:
     plan = plans.parse(text, str(settings.plan or "demo.toml"))
     _check(settings, plan)
     out = make_folder(settings.out).resolve()
-    progress.say("starting the emulated rig, the rig's services and the lab's subscribers")
+    progress.say(
+        "starting the emulated rig, the rig's services and the lab's subscribers (the first time, kernels compile)"
+    )
     with ProcessTree(out / "logs") as tree, running_rig(settings, out, tree) as rig:
         started_s = time.monotonic()
         calibration = _calibrate(rig, out, progress)
@@ -89,6 +92,7 @@ def run_demo(settings: DemoSettings, progress: Progress) -> Report:
             **scan_report(out / "raw.mcap", done),
             "seed": settings.seed,
             "maps": score_maps(out / "map.npz", truth, plan.map),
+            "expectations": judge_map(out / "map.npz", truth, plan.map),
             "timing": {
                 "total_s": total_s,
                 "optical_pass_s": passes.seconds["optical"],

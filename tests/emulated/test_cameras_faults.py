@@ -35,11 +35,13 @@ def peer() -> Iterator[CameraPeer]:
 @pytest.fixture
 def camera(peer: CameraPeer) -> Iterator[Camera]:
     found = open_camera(CameraSettings(address=peer.address), "left")
-    found.start()
-    peer.fire(1e-3)
-    assert found.read(20.0).frame_id == 1  # the renderers are compiled now
-    yield found
-    found.close()
+    try:
+        found.start()
+        peer.fire(1e-3)
+        assert found.read(100.0).frame_id == 1  # the renderers are compiled now
+        yield found
+    finally:
+        found.close()
 
 
 def test_a_dropped_frame_is_silence_and_then_a_gap_in_the_ids(peer: CameraPeer, camera: Camera) -> None:

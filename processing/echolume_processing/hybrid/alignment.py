@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echolume_processing.hybrid.channel import Gate
-from echolume_processing.hybrid.setup_error import NAMES, UNSURE_FIRST, Solution
+from echolume_processing.hybrid.setup_error import NAMES, SHARED, UNSURE_FIRST, Solution
 
 GAIN_TERMS = 4
 HALF_PRIOR = 0.5
 """An error counts as determined if the echoes leave less than this share of its prior's sigma."""
+SURE = 3.0
 TUNING = 1.345
 """Huber's constant: 95 % of the efficiency on clean data."""
 REWEIGHTED = 5
@@ -105,39 +106,51 @@ def equations(
     along = (scaled.conj() * predicted).real.sum(axis=3) / energy
     scaled = scaled - along[..., None] * predicted
     whole = np.maximum((np.abs(measured) ** 2).sum(axis=(1, 2)), np.finfo(np.float32).tiny).astype(np.float64)
-    normal = np.einsum("akct,bkct->kab", scaled.conj(), scaled).real / whole[:, None, None]
-    right = np.einsum("akct,kct->ka", scaled.conj(), left).real / whole[:, None]
+    flat = np.moveaxis(scaled, 0, 1).reshape(len(measured), len(columns), measured[0].size)
+    flat = np.concatenate((flat.real, flat.imag), axis=2)
+    rest = left.reshape(len(measured), -1)
+    rest = np.concatenate((rest.real, rest.imag), axis=1)
+    normal = flat @ flat.transpose(0, 2, 1) / whole[:, None, None]
+    right = (flat @ rest[..., None])[..., 0] / whole[:, None]
     return Equations(normal.astype(np.float64), right.astype(np.float64), (np.abs(left) ** 2).sum(axis=(1, 2)) / whole)
 
 
 def solve(
-    some: Equations, weight: NDArray[np.float64], prior: NDArray[np.float64], free: NDArray[np.bool_]
+    some: Equations, weight: NDArray[np.float64], prior: NDArray[np.float64], sought: NDArray[np.bool_]
 ) -> Solution:
-    """Errors that explain the pings best: Huber's weights, and what the echoes do not tell left at the prior.
+    """Errors that explain the pings best; what the echoes do not tell, or do not contradict, stays as calibrated.
 
     Parameters
     ----------
     some
-        Of pings that agree with their prediction.
+        Of the pings that vote.
     weight : (pings,) float64
         Of each ping, before it is judged by its own delay.
     prior : (errors,) float64
         Sigma of each error around 0.
-    free : (errors,) bool
-        Which are sought.
+    sought : (errors,) bool
+        Those that the equations are about.
 
     Notes
     -----
     The covariance is the sandwich of the pings' own scores, so errors of the predictor count as they scatter over
-    the pings; what all pings share is not in it.
+    the pings. What all pings share is not in it: that is `SHARED`, and an error within `SURE` of both sigmas is no
+    error of the set-up.
     """
-    free = free.copy()
+    free, held = sought.copy(), np.zeros(sought.size, dtype=np.bool_)
+    sigma = np.where(sought, 0.0, prior)
     while True:
         value, spread = _reweighted(some, weight, prior, free)
         unsure = [j for j in UNSURE_FIRST if free[j] and spread[j] > HALF_PRIOR * prior[j]]
-        if not unsure:
-            return Solution(value, np.where(free, spread, prior), free)
-        free[unsure[0]] = False
+        if unsure:
+            free[unsure[0]], sigma[unsure[0]] = False, prior[unsure[0]]
+            continue
+        whole = np.hypot(spread, SHARED)
+        ratio = np.where(free & (SHARED > 0), np.abs(value) / whole, np.inf)
+        least = int(ratio.argmin())
+        if ratio[least] >= SURE:
+            return Solution(value, np.where(free, whole, sigma), free | held)
+        free[least], held[least], sigma[least] = False, True, whole[least]
 
 
 def _reweighted(

@@ -39,10 +39,6 @@ SHIFT_MM = 0.5
 """Step of the derivative by x and y."""
 ANEW_MM = 0.2
 """An element that moved further than this gets its echoes predicted anew; smaller moves only delay them."""
-SURE = 3.0
-SHARED_MM = 0.1
-"""A shift in x, y or a yaw is made only beyond so many sigmas, to which belongs how far off light may see all edges."""
-SHARED = np.array([0, 0, 0, SHARED_MM, SHARED_MM, SHARED_MM / 70, 0, 0, 0, 0], dtype=np.float64)
 COARSE_ROUNDS = 20
 
 
@@ -207,11 +203,6 @@ class _Problem:
             about_zero = replace(some, right=some.right + np.einsum("kab,b->ka", some.normal, value))
             answer = solve(about_zero, weight, found.prior, free)
             value, sigma, determined = answer.value, answer.sigma, answer.determined
-            if view.sideways is not None:
-                doubtful = np.abs(value) < SURE * np.hypot(sigma, SHARED)
-                doubtful &= SHARED > 0
-                if (doubtful & free & determined).any():
-                    free = free & ~doubtful
         return value, sigma, determined
 
     def _columns(

@@ -24,13 +24,22 @@ SHIFTS = (3, 4, 5)
 """Those that a level bench does not show."""
 UNSURE_FIRST = (5, 3, 4, 6, 7, 9, 8, 1, 2)
 """Which is given up first where the echoes cannot tell two apart. The height is never given up."""
-MAY_BE_OFF = np.array([0.5, 4e-3, 4e-3, 0.5, 0.5, 4e-3, 4e-3, 4e-3, 5e-3, 5e-3])
-"""One sigma of what happens to a rig after its calibration: 0.5 mm, 0.23 deg, 3 K."""
+MAY_BE_OFF = np.array([0.5, 4e-3, 4e-3, 0.5, 0.5, 4e-3, 4e-3, 4e-3, 5e-3, 0.0])
+"""One sigma of what happens to a rig after its calibration: 0.5 mm, 0.23 deg, 3 K; the drift is the thermometer's."""
+SHARED = np.array([0.0, 1e-4, 1e-4, 0.08, 0.08, 1e-3, 3e-4, 3e-4, 4e-4, 1e-4])
+"""One sigma of what all pings share: where light puts edges, how the predictor's waveforms differ. None of the height,
+which takes up every delay that is in all echoes."""
+STEADY = 2e-4
+"""The air may drift by so much while the thermometer stands still, 0.1 K to either side of the middle."""
 
 
 @dataclass(frozen=True)
 class Solution:
-    """Errors of the set-up, in the order of `NAMES`; those not determined are left at 0 with the prior's sigma."""
+    """Errors of the set-up, in the order of `NAMES`.
+
+    One that is not determined is 0, with the prior's sigma; one that is, and is no more than its sigma explains, is 0
+    with its own sigma: the calibration holds.
+    """
 
     value: NDArray[np.float64]
     sigma: NDArray[np.float64]
@@ -75,13 +84,16 @@ def moved(apertures: Sequence[Aperture], value: NDArray[np.float64]) -> tuple[Ap
     return tuple(out)
 
 
-def prior_sigma(pose_covariance: NDArray[np.float64] | None) -> NDArray[np.float64]:
+def prior_sigma(pose_covariance: NDArray[np.float64] | None, drift: float) -> NDArray[np.float64]:
     """How far off each may be, (10,): what the calibration leaves open and what happens after it.
 
     Parameters
     ----------
     pose_covariance : (6, 6) float64 or None
         Of x, y, z in mm and the rotation vector in rad, rig axes; None where the calibration states none.
+    drift
+        Of the speed of sound as the thermometer tells it, from the middle of the scan to its end, as a share. A slow
+        thermometer misses up to as much again.
     """
     calibrated = np.zeros(len(NAMES))
     if pose_covariance is not None:
@@ -89,7 +101,9 @@ def prior_sigma(pose_covariance: NDArray[np.float64] | None) -> NDArray[np.float
         calibrated[[3, 4, 0]] = spread[:3]
         calibrated[[1, 2, 5]] = spread[3:]
         calibrated[[6, 7]] = spread[3:5]
-    return np.hypot(calibrated, MAY_BE_OFF)
+    sigma = np.hypot(calibrated, MAY_BE_OFF)
+    sigma[DRIFT] = np.hypot(STEADY, drift)
+    return sigma
 
 
 def faster(value: NDArray[np.float64], order: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -105,7 +105,8 @@ def sounding(pings: Sequence[Ping], calibration: ArrayCalibration) -> Sounding:
     measured = np.stack([window.waveform(response.measured(p) * early) for p in pings])
     measured = at_assumed_speed(window, response.response, measured, faster)
     energy = (np.abs(measured).astype(np.float64) ** 2).sum(axis=(1, 2))
-    prior = prior_sigma(array_pose_covariance(calibration, np.mean([p.robot_pose for p in pings], axis=0)))
+    middle = np.mean([p.robot_pose for p in pings], axis=0)
+    prior = prior_sigma(array_pose_covariance(calibration, middle), 0.5 * float(np.ptp(faster)))
     return Sounding(band, predictor, response, window, speed_mps, apertures, measured, energy, order, prior)
 
 

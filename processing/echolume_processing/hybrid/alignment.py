@@ -11,6 +11,8 @@ from echolume_processing.hybrid.channel import Gate
 from echolume_processing.hybrid.setup_error import NAMES, SHARED, UNSURE_FIRST, Solution
 
 GAIN_TERMS = 4
+HEARD = 1e-3
+"""Below this share of its largest, a response is taken to be none."""
 HALF_PRIOR = 0.5
 """An error counts as determined if the echoes leave less than this share of its prior's sigma."""
 SURE = 3.0
@@ -32,7 +34,7 @@ def at_assumed_speed(
     gate
         Of the waveforms.
     response : (receivers, bins) complex64
-        Of the channels: it does not stretch with the air.
+        Of the channels and the band filter: they do not stretch with the air.
     measured : (pings, receivers, samples) complex64
         Gated.
     faster : (pings,) float64
@@ -47,12 +49,15 @@ def at_assumed_speed(
     frequency_hz = gate.band.frequency_hz
     time_s = (gate.first + np.arange(gate.last - gate.first)) * gate.band.length / gate.band.sample_rate_hz
     time_s = time_s / gate.samples
+    floor = HEARD * np.abs(response).max(axis=1, keepdims=True)
     out = np.empty_like(measured)
     for k, share in enumerate(faster):
         heard_hz = frequency_hz * (1 + share)
         turn = np.exp(2j * np.pi * (frequency_hz[0] - heard_hz)[:, None] * time_s)
         spectrum = measured[k] @ turn.T.astype(np.complex64)
-        spectrum *= response / _between(frequency_hz, response, heard_hz)
+        there = _between(frequency_hz, response, heard_hz)
+        heard = np.abs(there) > floor
+        spectrum *= np.where(heard, response / np.where(heard, there, 1.0), 1.0)
         out[k] = gate.samples_of(spectrum.astype(np.complex64))
     return out
 

@@ -39,6 +39,8 @@ SHIFT_MM = 0.5
 """Step of the derivative by x and y."""
 ANEW_MM = 0.2
 """An element that moved further than this gets its echoes predicted anew; smaller moves only delay them."""
+STRETCH = 1e-4
+"""Step of the derivative by the speed of sound."""
 COARSE_ROUNDS = 20
 
 
@@ -141,6 +143,7 @@ class _Problem:
         self._up = move[:, :, :1, 2] + move[:, :, 1:, 2]  # (POSE, pings, receivers): by what the path is longer
         self._aside = move[:, :, 0, :2]  # (POSE, pings, 2)
         self._move = move
+        self._response = found.channels.response * found.channels.filter
         self._wave = (2 * np.pi * found.band.frequency_hz / (found.speed_mps * 1e3)).astype(np.float32)
 
     def first_look(self) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
@@ -217,17 +220,17 @@ class _Problem:
             for j in range(POSE):
                 for a in range(2):
                     out[j] = out[j] + self._aside[j, which, a][:, None, None].astype(np.float32) * aside[a]
-        samples = np.arange(gate.first, gate.last, dtype=np.float64)
-        path_mm = samples * (gate.band.length / gate.band.sample_rate_hz / gate.samples * self._found.speed_mps * 1e3)
-        sooner = -path_mm.astype(np.float32) * longer
+        predicted = gate.waveform(spectra.astype(np.complex64))
+        step, response = np.full(which.size, STRETCH), self._response
+        later = at_assumed_speed(gate, response, predicted, step)
+        sooner = (at_assumed_speed(gate, response, predicted, -step) - later) / np.float32(2 * STRETCH)
         drifting = self._found.order[which][:, None, None].astype(np.float32) * sooner
-        # the measured echoes are brought to the assumed speed, so a faster sound shows in them the other way round
         return np.stack([*out, sooner, drifting])
 
     def _measured(self, value: NDArray[np.float64], which: NDArray[np.int64]) -> NDArray[np.complex64]:
         found = self._found
         share = faster(value, found.order[which])
-        return at_assumed_speed(found.gate, found.channels.response, found.measured[which], share)
+        return at_assumed_speed(found.gate, self._response, found.measured[which], share)
 
     def _predicted(self, value: NDArray[np.float64], which: NDArray[np.int64]) -> NDArray[np.complex64]:
         return self._delayed(self._base[which], value, which)

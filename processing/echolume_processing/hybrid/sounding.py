@@ -103,7 +103,7 @@ def sounding(pings: Sequence[Ping], calibration: ArrayCalibration) -> Sounding:
         2 * (float(z_mm.max()) - FLOOR_MM) / (speed_mps * 1e3) + _pulse_s(calibration),
     )
     measured = np.stack([window.waveform(response.measured(p) * early) for p in pings])
-    measured = at_assumed_speed(window, response.response, measured, faster)
+    measured = at_assumed_speed(window, response.response * response.filter, measured, faster)
     energy = (np.abs(measured).astype(np.float64) ** 2).sum(axis=(1, 2))
     middle = np.mean([p.robot_pose for p in pings], axis=0)
     prior = prior_sigma(array_pose_covariance(calibration, middle), 0.5 * float(np.ptp(faster)))

@@ -51,6 +51,8 @@ class _View:
     which: NDArray[np.int64]
     sideways: NDArray[np.complex64] | None
     """Derivative (2, pings, receivers, bins) of the spectra by x and y; None where nobody has looked."""
+    at: NDArray[np.float64]
+    """Errors that those were taken at."""
 
 
 def register(
@@ -86,7 +88,7 @@ def register(
     if (reason := _too_few(agree)) is not None:
         return found, predicted, Registration(0.0, found.speed_mps, refused=reason)
     before = problem.residual(np.zeros(len(NAMES)))
-    view = problem.view(agree, scene, value)
+    view = problem.view(agree, scene)
     value, sigma, determined = problem.solve(view, value)
     if scene is not None and problem.reach_mm(value) > ANEW_MM:
         problem = problem.predicted_anew(scene, value)
@@ -166,12 +168,12 @@ class _Problem:
         value[:3] = fit
         return value, (there > 0) & (1 - there**2 < 2 * ALIKE)
 
-    def view(self, agree: NDArray[np.bool_], scene: Surface | None, value: NDArray[np.float64]) -> _View:
+    def view(self, agree: NDArray[np.bool_], scene: Surface | None) -> _View:
         """The pings that vote, spread over the scan; with a scene, how their echoes change along it."""
         which = np.nonzero(agree)[0]
         which = which[np.linspace(0, which.size - 1, min(SURVEYED, which.size)).astype(np.int64)]
         if scene is None:
-            return _View(which, None)
+            return _View(which, None, self._at)
         found, sideways = self._found, list[NDArray[np.complex64]]()
         for axis in range(2):
             step_mm = np.zeros(3)
@@ -179,7 +181,7 @@ class _Problem:
             beside = tuple(Aperture(a.elements_mm + step_mm, a.axis) for a in found.apertures)
             there = replace(found, apertures=beside).predict(scene, which)
             sideways.append((there - self._base[which]) / np.float32(SHIFT_MM))
-        return _View(which, np.stack(sideways))
+        return _View(which, np.stack(sideways), self._at)
 
     def solve(
         self, view: _View, value: NDArray[np.float64]
@@ -197,7 +199,9 @@ class _Problem:
             spectra = self._predicted(value, which)
             if view.sideways is not None:
                 apart = self._aside_of(value, which)
-                spectra = spectra + self._delayed(np.einsum("akcf,ka->kcf", view.sideways, apart), value, which)
+                spectra = spectra + self._delayed(
+                    np.einsum("akcf,ka->kcf", view.sideways, apart), value - view.at, which
+                )
             predicted = found.gate.waveform(spectra.astype(np.complex64))
             some = equations(measured, predicted, self._columns(view, spectra, value))
             alike = some.residual < 2 * ALIKE
@@ -216,7 +220,7 @@ class _Problem:
         longer = gate.waveform((spectra * (-1j * self._wave)).astype(np.complex64))
         out = [self._up[j, which][..., None].astype(np.float32) * longer for j in range(POSE)]
         if view.sideways is not None:
-            aside = [gate.waveform(self._delayed(view.sideways[a], value, which)) for a in range(2)]
+            aside = [gate.waveform(self._delayed(view.sideways[a], value - view.at, which)) for a in range(2)]
             for j in range(POSE):
                 for a in range(2):
                     out[j] = out[j] + self._aside[j, which, a][:, None, None].astype(np.float32) * aside[a]
@@ -233,13 +237,13 @@ class _Problem:
         return at_assumed_speed(found.gate, self._response, found.measured[which], share)
 
     def _predicted(self, value: NDArray[np.float64], which: NDArray[np.int64]) -> NDArray[np.complex64]:
-        return self._delayed(self._base[which], value, which)
+        return self._delayed(self._base[which], value - self._at, which)
 
     def _delayed(
-        self, spectra: NDArray[np.complex64], value: NDArray[np.float64], which: NDArray[np.int64]
+        self, spectra: NDArray[np.complex64], since: NDArray[np.float64], which: NDArray[np.int64]
     ) -> NDArray[np.complex64]:
-        """Spectra later by what the set-up has moved since they were predicted."""
-        longer_mm = np.tensordot((value - self._at)[:POSE], self._up[:, which], axes=1)
+        """Spectra later by what the set-up has moved by since they were predicted."""
+        longer_mm = np.tensordot(since[:POSE], self._up[:, which], axes=1)
         return (spectra * np.exp(-1j * longer_mm[..., None].astype(np.float32) * self._wave)).astype(np.complex64)
 
     def _aside_of(self, value: NDArray[np.float64], which: NDArray[np.int64]) -> NDArray[np.float64]:

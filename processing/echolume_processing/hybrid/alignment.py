@@ -151,7 +151,7 @@ def solve(
             free[unsure[0]], sigma[unsure[0]] = False, prior[unsure[0]]
             continue
         whole = np.hypot(spread, SHARED)
-        ratio = np.where(free & (SHARED > 0), np.abs(value) / whole, np.inf)
+        ratio = np.where(free & (SHARED > 0), np.abs(value) / np.maximum(whole, 1e-12), np.inf)
         least = int(ratio.argmin())
         if ratio[least] >= SURE:
             return Solution(value, np.where(free, whole, sigma), free | held)

@@ -198,10 +198,8 @@ class _Problem:
             measured = self._measured(value, which)
             spectra = self._predicted(value, which)
             if view.sideways is not None:
-                apart = self._aside_of(value, which)
-                spectra = spectra + self._delayed(
-                    np.einsum("akcf,ka->kcf", view.sideways, apart), value - view.at, which
-                )
+                aside = np.einsum("akcf,ka->kcf", view.sideways, self._aside_of(value, which))
+                spectra = spectra + self._delayed(aside, value - view.at, which)
             predicted = found.gate.waveform(spectra.astype(np.complex64))
             some = equations(measured, predicted, self._columns(view, spectra, value))
             alike = some.residual < 2 * ALIKE

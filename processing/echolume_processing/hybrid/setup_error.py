@@ -26,7 +26,7 @@ UNSURE_FIRST = (5, 3, 4, 6, 7, 9, 8, 1, 2)
 """Which is given up first where the echoes cannot tell two apart. The height is never given up."""
 MAY_BE_OFF = np.array([0.5, 4e-3, 4e-3, 0.5, 0.5, 4e-3, 4e-3, 4e-3, 5e-3, 0.0])
 """One sigma of what happens to a rig after its calibration: 0.5 mm, 0.23 deg, 3 K; the drift is the thermometer's."""
-SHARED = np.array([0.0, 1e-4, 1e-4, 0.08, 0.08, 1e-3, 3e-4, 3e-4, 4e-4, 1e-4])
+SHARED = np.array([0.0, 1e-4, 1e-4, 0.1, 0.1, 1e-3, 3e-4, 3e-4, 4e-4, 1e-4])
 """One sigma of what all pings share: where light puts edges, how the predictor's waveforms differ. None of the height,
 which takes up every delay that is in all echoes."""
 STEADY = 2e-4

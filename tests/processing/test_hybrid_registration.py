@@ -165,6 +165,13 @@ def test_air_that_warms_during_the_scan_is_found_from_the_echoes() -> None:
     assert registration.residual_db < registration.before_db
 
 
+def test_glass_over_everything_is_no_array_that_sits_lower(bench: Scan) -> None:
+    raised = lit(SceneBuilder("bench").build())
+    below = surface(raised.height_mm - 1.9, FIELD)  # light looks through glass 1.9 mm above the bench
+    registration = register(*bench.heard(bench.array, below), below)[2]
+    assert "would move dz_mm" in registration.refused
+
+
 def test_it_refuses_where_sound_hears_nothing_of_what_light_saw(bench: Scan) -> None:
     board = SceneBuilder("board")
     board.box((-120, 120), (-120, 120), 20.0)

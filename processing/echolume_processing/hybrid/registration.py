@@ -30,7 +30,7 @@ LEAST_PINGS = 12
 """Fewer agreeing pings than this do not register a scan,"""
 LEAST_SHARE = 0.05
 """nor a smaller share of all pings: among many, some agree by chance."""
-TOO_FAR = 4.0
+TOO_FAR = 3.0
 """A move of so many sigmas of what a set-up may be off is none: something else was taken for the surface."""
 ROUNDS = 4
 SURVEYED = 120

@@ -8,14 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echolume_processing.hybrid.channel import Gate
-from echolume_processing.hybrid.setup_error import NAMES, SHARED, UNSURE_FIRST, Solution
+from echolume_processing.hybrid.setup_error import NAMES, SHARED, SPEED, UNSURE_FIRST, Solution
 
 GAIN_TERMS = 4
 HEARD = 1e-3
 """Below this share of its largest, a response is taken to be none."""
 HALF_PRIOR = 0.5
-"""An error counts as determined if the echoes leave less than this share of its prior's sigma."""
+"""An error counts as determined if the echoes leave less than this share of its prior's sigma,"""
+LEAST_OWN = 3e-3
+"""nor, if it is the speed of sound, with less than this share of its effect its own. Over level ground it does to each
+ping what the height does, and what little is left is no more than the predictor's waveforms are off."""
 SURE = 3.0
+"""An error within so many sigmas is none."""
 TUNING = 1.345
 """Huber's constant: 95 % of the efficiency on clean data."""
 REWEIGHTED = 5
@@ -145,8 +149,10 @@ def solve(
     free, held = sought.copy(), np.zeros(sought.size, dtype=np.bool_)
     sigma = np.where(sought, 0.0, prior)
     while True:
-        value, spread = _reweighted(some, weight, prior, free)
-        unsure = [j for j in UNSURE_FIRST if free[j] and spread[j] > HALF_PRIOR * prior[j]]
+        value, spread, own = _reweighted(some, weight, prior, free)
+        vague = spread > HALF_PRIOR * prior
+        vague[SPEED] |= own < LEAST_OWN
+        unsure = [j for j in UNSURE_FIRST if free[j] and vague[j]]
         if unsure:
             free[unsure[0]], sigma[unsure[0]] = False, prior[unsure[0]]
             continue
@@ -160,8 +166,8 @@ def solve(
 
 def _reweighted(
     some: Equations, weight: NDArray[np.float64], prior: NDArray[np.float64], free: NDArray[np.bool_]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Value and sigma of the free errors, 0 elsewhere."""
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Value and sigma of the free errors, 0 elsewhere; and how much of the speed's effect is its own."""
     at = np.nonzero(free)[0]
     normal, right = some.normal[:, at][:, :, at], some.right[:, at]
     height = some.normal[:, 0, 0]
@@ -175,14 +181,23 @@ def _reweighted(
         robust = np.minimum(1.0, TUNING * spread_mm / np.maximum(np.abs(own_mm), 1e-9))
         # a ping of usual weight tells the height to `spread_mm`
         each = weight * robust / (float(np.median((weight * height)[weight > 0])) * spread_mm**2)
-    information = (each[:, None, None] * normal).sum(axis=0) + prior_information
-    inverse = np.linalg.inv(information)
+    told = (each[:, None, None] * normal).sum(axis=0)
+    inverse = np.linalg.inv(told + prior_information)
     step = inverse @ (each[:, None] * right).sum(axis=0)
     scores = each[:, None] * (right - normal @ step)
     value, spread = np.zeros(len(NAMES)), np.zeros(len(NAMES))
     value[at] = step
     spread[at] = np.sqrt(np.diag(inverse @ (scores.T @ scores + prior_information) @ inverse))
-    return value, spread
+    return value, spread, _own_share(told, at)
+
+
+def _own_share(told: NDArray[np.float64], at: NDArray[np.int64]) -> float:
+    """Which share of the effect of the speed of sound none of the other free errors has; 1 where it is not free."""
+    if SPEED not in at:
+        return 1.0
+    size = np.sqrt(np.maximum(np.diag(told), np.finfo(np.float64).tiny))
+    inverse = np.linalg.inv(told / np.outer(size, size) + 1e-9 * np.eye(at.size))
+    return float(1 / inverse[at == SPEED, at == SPEED][0])
 
 
 def smooth_gain(

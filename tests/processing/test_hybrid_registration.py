@@ -268,9 +268,9 @@ def test_an_echo_in_faster_air_is_brought_to_the_assumed_speed(bench: Scan) -> N
 
 def test_the_prior_is_what_the_calibration_leaves_open_and_what_happens_after() -> None:
     covariance = np.diag([1.2, 0.0, 0.0, 0.0, 0.0, 0.0]) ** 2
-    assert prior_sigma(covariance, 0.0)[NAMES.index("x_mm")] == pytest.approx(1.3)
-    np.testing.assert_array_equal(prior_sigma(None, 0.0)[:DRIFT], MAY_BE_OFF[:DRIFT])
-    still, warming = prior_sigma(None, 0.0)[DRIFT], prior_sigma(None, 3e-3)[DRIFT]
+    assert prior_sigma(covariance, 0.0, 344.0)[NAMES.index("x_mm")] == pytest.approx(1.3)
+    np.testing.assert_array_equal(prior_sigma(None, 0.0, 344.0)[:DRIFT], MAY_BE_OFF[:DRIFT])
+    still, warming = prior_sigma(None, 0.0, 344.0)[DRIFT], prior_sigma(None, 1.0, 344.0)[DRIFT]
     assert still < 0.1 * warming
 
 

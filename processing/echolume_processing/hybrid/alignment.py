@@ -16,8 +16,8 @@ HEARD = 1e-3
 HALF_PRIOR = 0.5
 """An error counts as determined if the echoes leave less than this share of its prior's sigma,"""
 LEAST_OWN = 3e-3
-"""nor, if it is the speed of sound, with less than this share of its effect its own. Over level ground it does to each
-ping what the height does, and what little is left is no more than the predictor's waveforms are off."""
+"""nor, if it is the speed of sound, with less than this share of its effect not the height's too. Over level ground
+the two do the same to each ping, and what little is left is no more than the predictor's waveforms are off."""
 SURE = 3.0
 """An error within so many sigmas is none."""
 TUNING = 1.345
@@ -192,12 +192,11 @@ def _reweighted(
 
 
 def _own_share(told: NDArray[np.float64], at: NDArray[np.int64]) -> float:
-    """Which share of the effect of the speed of sound none of the other free errors has; 1 where it is not free."""
+    """Which share of the effect of the speed of sound the height has not; 1 where the speed is not free."""
     if SPEED not in at:
         return 1.0
-    size = np.sqrt(np.maximum(np.diag(told), np.finfo(np.float64).tiny))
-    inverse = np.linalg.inv(told / np.outer(size, size) + 1e-9 * np.eye(at.size))
-    return float(1 / inverse[at == SPEED, at == SPEED][0])
+    speed = int(np.nonzero(at == SPEED)[0][0])
+    return float(1 - told[0, speed] ** 2 / (told[0, 0] * told[speed, speed]))
 
 
 def smooth_gain(

@@ -84,16 +84,16 @@ def moved(apertures: Sequence[Aperture], value: NDArray[np.float64]) -> tuple[Ap
     return tuple(out)
 
 
-def prior_sigma(pose_covariance: NDArray[np.float64] | None, drift: float) -> NDArray[np.float64]:
+def prior_sigma(pose_covariance: NDArray[np.float64] | None, drift_mps: float, speed_mps: float) -> NDArray[np.float64]:
     """How far off each may be, (10,): what the calibration leaves open and what happens after it.
 
     Parameters
     ----------
     pose_covariance : (6, 6) float64 or None
         Of x, y, z in mm and the rotation vector in rad, rig axes; None where the calibration states none.
-    drift
-        Of the speed of sound as the thermometer tells it, from the middle of the scan to its end, as a share. A slow
-        thermometer misses up to as much again.
+    drift_mps, speed_mps
+        Change of the speed of sound as the thermometer tells it, from the middle of the scan to its end, and the speed.
+        A slow thermometer misses up to as much again.
     """
     calibrated = np.zeros(len(NAMES))
     if pose_covariance is not None:
@@ -102,7 +102,7 @@ def prior_sigma(pose_covariance: NDArray[np.float64] | None, drift: float) -> ND
         calibrated[[1, 2, 5]] = spread[3:]
         calibrated[[6, 7]] = spread[3:5]
     sigma = np.hypot(calibrated, MAY_BE_OFF)
-    sigma[DRIFT] = np.hypot(STEADY, drift)
+    sigma[DRIFT] = np.hypot(STEADY, drift_mps / speed_mps)
     return sigma
 
 

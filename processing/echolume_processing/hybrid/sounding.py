@@ -106,7 +106,7 @@ def sounding(pings: Sequence[Ping], calibration: ArrayCalibration) -> Sounding:
     measured = at_assumed_speed(window, response.response * response.filter, measured, faster)
     energy = (np.abs(measured).astype(np.float64) ** 2).sum(axis=(1, 2))
     middle = np.mean([p.robot_pose for p in pings], axis=0)
-    prior = prior_sigma(array_pose_covariance(calibration, middle), 0.5 * float(np.ptp(faster)))
+    prior = prior_sigma(array_pose_covariance(calibration, middle), 0.5 * float(np.ptp(faster)) * speed_mps, speed_mps)
     return Sounding(band, predictor, response, window, speed_mps, apertures, measured, energy, order, prior)
 
 

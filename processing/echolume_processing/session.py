@@ -42,7 +42,7 @@ class Results(TypedDict):
     files: list[str]
     points: dict[str, int]
     cells: dict[str, int]
-    registration: dict[str, float]
+    registration: dict[str, object]
     notes: list[str]
 
 
@@ -148,12 +148,7 @@ def conclude(evidence: Evidence, out: Path, progress: Progress = silent) -> tupl
         files=["hybrid.rrd", "hybrid.ply", "map.npz", *(f"figures/{path.name}" for path in drawn)],
         points=evidence.counts(),
         cells={label.name.lower(): int(labels[label]) for label in recording.LABELS},
-        registration={
-            "dz_mm": found.registration.dz_mm,
-            "speed_of_sound_mps": found.registration.speed_of_sound_mps,
-            "pings": found.registration.pings,
-            "residual_db": found.registration.residual_db,
-        },
+        registration=found.registration.report(),
         notes=list(found.notes),
     )
     return found, results

@@ -63,8 +63,10 @@ class Channels:
         return (spectrum * late * self.filter).astype(np.complex64)
 
 
-def channels(calibration: ArrayCalibration, band: Band, predictor: Predictor) -> Channels:
+def channels(calibration: ArrayCalibration, band: Band) -> Channels:
     """Response of each channel: its template over the predicted impulse of the same reference plate.
+
+    Both are of the air of the calibration, so the response is the channels' alone and holds in any air.
 
     Raises
     ------
@@ -76,7 +78,7 @@ def channels(calibration: ArrayCalibration, band: Band, predictor: Predictor) ->
             f"array templates were taken at {calibration.sample_rate_hz} Hz, the pings at {band.sample_rate_hz} Hz; "
             "run `echolume calibrate array` with the digitiser's present settings"
         )
-    plate = _reference_impulse(calibration, predictor)
+    plate = _reference_impulse(calibration, Predictor(calibration.radius_mm, calibration.speed_of_sound_mps, band))
     elements = np.array([calibration.emitter_mm, *calibration.receivers_mm])
     image = elements[0] + np.array([0.0, 0.0, 2 * calibration.reference_mm])
     arrival_s = np.linalg.norm(elements[1:] - image, axis=1) / (calibration.speed_of_sound_mps * 1e3)
@@ -139,10 +141,13 @@ class Gate:
 
     def waveform(self, spectrum: NDArray[np.complex64]) -> NDArray[np.complex64]:
         """Gated complex waveform (..., last - first) of band spectra (..., bins)."""
+        return self.samples_of(spectrum) * self.window
+
+    def samples_of(self, spectrum: NDArray[np.complex64]) -> NDArray[np.complex64]:
+        """The same without the gate's soft edges, for what has passed them already."""
         padded = np.zeros((*spectrum.shape[:-1], self.samples), dtype=np.complex64)
         padded[..., : spectrum.shape[-1]] = spectrum
-        whole = ifft(padded)
-        return whole[..., self.first : self.last] * self.window
+        return ifft(padded)[..., self.first : self.last]
 
     def spectrum(self, waveform: NDArray[np.complex64]) -> NDArray[np.complex64]:
         """Band spectra (..., bins) of gated waveforms (..., last - first)."""

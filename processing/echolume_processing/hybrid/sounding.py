@@ -11,22 +11,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echolume_messages.calibration import ArrayCalibration
+from echolume_processing.hybrid.alignment import at_assumed_speed
 from echolume_processing.hybrid.channel import Channels, Gate, band_of, channels, gate, speed_of_sound
-from echolume_processing.hybrid.model import Registration
 from echolume_processing.hybrid.predict import Aperture, Band, Predictor, aperture
+from echolume_processing.hybrid.registration import register
+from echolume_processing.hybrid.setup_error import prior_sigma
 from echolume_processing.hybrid.surface import Surface
 from echolume_processing.ping import Ping
+from echolume_processing.ultrasonic.pose_covariance import array_pose_covariance
+
+__all__ = ["Sounding", "Spectra", "Waveforms", "register", "sounding"]
 
 CEILING_MM = 70.0
 """No scene is higher than this above the bench."""
 FLOOR_MM = -20.0
 PULSE_ENERGY = 0.98
-SEARCH_MM = 1.5
-"""Self-registration looks this far up and down."""
-STEP_MM = 0.02
-GAIN_TERMS = 4
-BEST_SHARE = 1 / 3
-"""So many pings, the best ones, register the array; the others may look at what light cannot see."""
+LEAST_FOR_A_LINE = 10
+"""Fewer pings than this say nothing about a drift of the air."""
 
 Waveforms = NDArray[np.complex64]
 """Gated complex waveforms (pings, receivers, samples)."""
@@ -43,11 +44,16 @@ class Sounding:
     channels: Channels
     gate: Gate
     speed_mps: float
+    """At which the predictions are made, and to which the measured echoes are brought."""
     apertures: tuple[Aperture, ...]
     measured: Waveforms
     """Gated waveforms of every ping, per receiver, the channels' delays removed."""
     energy: NDArray[np.float64]
     """(pings,)"""
+    order: NDArray[np.float64]
+    """Place of each ping in the scan, by its trigger: -1 for the first, 1 for the last."""
+    prior: NDArray[np.float64]
+    """One sigma of how far the set-up may be off, in the order of `setup_error.NAMES`."""
 
     @property
     def foot_mm(self) -> NDArray[np.float64]:
@@ -83,9 +89,10 @@ def sounding(pings: Sequence[Ping], calibration: ArrayCalibration) -> Sounding:
     if len(kinds) != 1:
         raise ValueError(f"pings: expected one length and sample rate, got {sorted(kinds)}")
     band = band_of(calibration, pings[0])
-    speed_mps = speed_of_sound(calibration, float(np.median([p.air_temperature_c for p in pings])))
+    order = _order(pings)
+    speed_mps, faster = _speeds(pings, order, calibration)
     predictor = Predictor(calibration.radius_mm, speed_mps, band)
-    raw = channels(calibration, band, predictor)
+    raw = channels(calibration, band)
     early = np.exp(2j * np.pi * band.frequency_hz * np.array(calibration.delays_s)[:, None]).astype(np.complex64)
     response = replace(raw, response=raw.response * early)
     apertures = tuple(aperture(calibration, p.robot_pose) for p in pings)
@@ -96,8 +103,35 @@ def sounding(pings: Sequence[Ping], calibration: ArrayCalibration) -> Sounding:
         2 * (float(z_mm.max()) - FLOOR_MM) / (speed_mps * 1e3) + _pulse_s(calibration),
     )
     measured = np.stack([window.waveform(response.measured(p) * early) for p in pings])
+    measured = at_assumed_speed(window, response.response * response.filter, measured, faster)
     energy = (np.abs(measured).astype(np.float64) ** 2).sum(axis=(1, 2))
-    return Sounding(band, predictor, response, window, speed_mps, apertures, measured, energy)
+    middle = np.mean([p.robot_pose for p in pings], axis=0)
+    prior = prior_sigma(array_pose_covariance(calibration, middle), 0.5 * float(np.ptp(faster)) * speed_mps, speed_mps)
+    return Sounding(band, predictor, response, window, speed_mps, apertures, measured, energy, order, prior)
+
+
+def _order(pings: Sequence[Ping]) -> NDArray[np.float64]:
+    """Triggers, laid from -1 to 1."""
+    trigger = np.array([p.trigger for p in pings], dtype=np.float64)
+    half = 0.5 * float(trigger[-1] - trigger[0])
+    return (trigger - trigger[0]) / half - 1 if half > 0 else np.zeros(trigger.size)
+
+
+def _speeds(
+    pings: Sequence[Ping], order: NDArray[np.float64], calibration: ArrayCalibration
+) -> tuple[float, NDArray[np.float64]]:
+    """Speed of sound in the middle of the scan (m/s), and by what share it was faster in each ping.
+
+    A line through the thermometer's readings: one of them is no better than some hundredths of a kelvin.
+    """
+    read_c = np.array([p.air_temperature_c for p in pings])
+    slope_c = 0.0
+    if len(pings) >= LEAST_FOR_A_LINE and (order**2).sum() > 0:
+        slope_c = float(((read_c - read_c.mean()) * order).sum() / ((order - order.mean()) ** 2).sum())
+    speed_mps = speed_of_sound(calibration, float(np.median(read_c - slope_c * order)))
+    each_c = np.median(read_c - slope_c * order) + slope_c * order
+    each_mps = np.array([speed_of_sound(calibration, float(c)) for c in each_c])
+    return speed_mps, each_mps / speed_mps - 1
 
 
 def _pulse_s(calibration: ArrayCalibration) -> float:
@@ -106,61 +140,3 @@ def _pulse_s(calibration: ArrayCalibration) -> float:
     after = np.cumsum(power) / power.sum()
     last = int(np.searchsorted(after, PULSE_ENERGY))
     return max(0.0, (last - calibration.template_origin) / calibration.sample_rate_hz)
-
-
-def register(found: Sounding, predicted: Spectra) -> tuple[Sounding, Spectra, Registration]:
-    """Bring predictions of all pings onto the measured echoes: one height offset, one smooth gain per channel.
-
-    Returns
-    -------
-    tuple
-        The sounding with the correction in its channels, the corrected predictions, and what was found.
-
-    Notes
-    -----
-    The offset is the median, over the best third of the pings, of the shift that fits each best, so pings over
-    glass do not take part. It also takes up most of an error in the speed of sound, since all ranges of a scan
-    are alike. The gain is a complex polynomial over frequency, fitted on the same pings.
-    """
-    everything = np.arange(len(found.apertures))
-    shifts_mm = np.arange(-SEARCH_MM, SEARCH_MM + STEP_MM / 2, STEP_MM)
-    slow = 2j * np.pi * found.band.frequency_hz * 2 / (found.speed_mps * 1e3)
-    like = _likeness(found, predicted, np.exp(-slow * shifts_mm[:, None]).astype(np.complex64))
-    best = like.argmax(axis=1)
-    peak = like[everything, best]
-    good = peak >= np.quantile(peak, 1 - BEST_SHARE)
-    dz_mm = float(np.median(shifts_mm[best[good]]))
-    turn = np.exp(-slow * dz_mm).astype(np.complex64)
-    gain = _gain(found, predicted[good] * turn, found.measured[good])
-    correction = (turn * gain).astype(np.complex64)
-    moved = replace(found, channels=replace(found.channels, response=found.channels.response * correction))
-    corrected = predicted * correction
-    residual = moved.residual(corrected[good], np.nonzero(good)[0])
-    return (
-        moved,
-        corrected,
-        Registration(dz_mm, found.speed_mps, int(good.sum()), float(10 * np.log10(np.median(residual)))),
-    )
-
-
-def _likeness(found: Sounding, predicted: Spectra, turns: NDArray[np.complex64]) -> NDArray[np.float64]:
-    """Normalised real correlation of each ping with its prediction under each turn, shape (pings, turns)."""
-    spectrum = found.gate.spectrum(found.measured)
-    cross = (spectrum * predicted.conj()).sum(axis=1)  # (pings, bins): summed over the receivers
-    power = (np.abs(spectrum) ** 2).sum(axis=(1, 2)) * (np.abs(predicted) ** 2).sum(axis=(1, 2))
-    return (cross @ turns.conj().T).real / np.sqrt(power)[:, None]
-
-
-def _gain(found: Sounding, predicted: Spectra, measured: Waveforms) -> NDArray[np.complex128]:
-    """Complex gain of each channel, a polynomial over the band, shape (receivers, bins)."""
-    seen = found.gate.spectrum(measured)
-    thought = found.gate.spectrum(found.gate.waveform(predicted))
-    at = np.linspace(-1, 1, found.band.bins.size)
-    terms = np.polynomial.chebyshev.chebvander(at, GAIN_TERMS - 1)  # (bins, terms)
-    cross = (seen * thought.conj()).sum(axis=0, dtype=np.complex128)  # (receivers, bins)
-    power = (np.abs(thought).astype(np.float64) ** 2).sum(axis=0)
-    out = np.empty(cross.shape, dtype=np.complex128)
-    for channel in range(cross.shape[0]):
-        normal = terms.T @ (power[channel, :, None] * terms)
-        out[channel] = terms @ np.linalg.solve(normal, terms.T @ cross[channel])
-    return out

@@ -54,7 +54,10 @@ def matte() -> SmallScan:
 
 @pytest.fixture(scope="module")
 def maps(scan: SmallScan, sound: Structured) -> dict[str, HybridMap]:
-    return {name: fuse_by(name, scan.optical, sound, scan.pings, scan.calibration, FIELD) for name in RULES}
+    some = {DEFAULT: scan.pings[::4]}
+    return {
+        name: fuse_by(name, scan.optical, sound, some.get(name, scan.pings), scan.calibration, FIELD) for name in RULES
+    }
 
 
 def light_at(height_mm: np.ndarray, seen: np.ndarray | None = None) -> Structured:
@@ -130,7 +133,7 @@ def test_the_order_of_points_and_pings_does_not_matter(name: str, scan: SmallSca
 
 
 def test_the_default_rule_is_the_fusion_itself(scan: SmallScan, sound: Structured, maps: dict[str, HybridMap]) -> None:
-    assert digest(maps[DEFAULT]) == digest(fuse(scan.optical, scan.pings, scan.calibration, FIELD))
+    assert digest(maps[DEFAULT]) == digest(fuse(scan.optical, scan.pings[::4], scan.calibration, FIELD))
 
 
 def test_the_plain_rules_have_the_heights_of_the_baselines(

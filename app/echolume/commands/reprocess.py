@@ -45,7 +45,8 @@ class _ListRules(argparse.Action):
     ) -> None:
         del namespace, values, option_string
         width = max(map(len, DESCRIPTIONS))
-        parser.exit(0, "".join(f"{name:{width}}  {text}\n" for name, text in DESCRIPTIONS.items()))
+        sys.stdout.write("".join(f"{name:{width}}  {text}\n" for name, text in DESCRIPTIONS.items()))
+        parser.exit(0)
 
 
 def run(args: argparse.Namespace) -> int:

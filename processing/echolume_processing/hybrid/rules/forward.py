@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from echolume_messages.calibration import Calibration
 from echolume_messages.types import ULTRASONIC_POINT, Structured
 from echolume_processing.hybrid import holes
-from echolume_processing.hybrid.fuse import MARGIN_MM
 from echolume_processing.hybrid.grid import accumulate, cell_index
 from echolume_processing.hybrid.model import HybridMap, Registration, widened
 from echolume_processing.hybrid.predict import Band
@@ -21,6 +20,9 @@ from echolume_processing.hybrid.sounding import Sounding, Spectra, register, sou
 from echolume_processing.hybrid.surface import surface
 from echolume_processing.ping import Ping
 from echolume_processing.ultrasonic.pipeline import UltrasonicPipeline
+
+MARGIN_MM = 80.0
+"""Sound sees this far beyond the map."""
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from comparison.hybrid_scans import Recorded
 from echolume import scoring
 from echolume.evaluation import images
-from echolume.evaluation.evaluate import Evaluation, Sources, evaluate
+from echolume.evaluation.evaluate import Evaluation, Metrology, Sources, evaluate, metrology
 from echolume_messages.calibration import Calibration
 from echolume_messages.types import Label, Structured
 from echolume_processing.hybrid.model import HybridMap
@@ -61,6 +62,8 @@ def row(found: HybridMap, recorded: Recorded) -> Row:
     glass = said["glass"] or {}
     hidden = truth.label == Label.UNKNOWN
     within = said["consistency"]["non_edge"]
+    matte = replace(truth, front_mm=np.where(truth.label == Label.MATTE, truth.front_mm, np.nan))
+    made = metrology(claimed, matte, field)
     return {
         "f1_1mm": said["all"]["f1_at_1mm"],
         "f1_1mm_nonedge": said["non_edge"]["f1_at_1mm"],
@@ -74,16 +77,17 @@ def row(found: HybridMap, recorded: Recorded) -> Row:
         "transparent_pct": 100 * float(np.mean(label == Label.TRANSPARENT)),
         "hidden_unknown_pct": 100 * float(np.mean(label[hidden] == Label.UNKNOWN)) if hidden.any() else NAN,
         "nees": _number(within["nees"]),
+        "nees_median": _number(within["nees_median"]),
         "coverage95_pct": 100 * _number(within["coverage95"]),
-        "step_light_mm": _step(said, "light"),
-        "step_sound_mm": _step(said, "sound"),
-        "flatness_mm": _number(said["metrology"]["flatness_mm"]),
+        "step_light_mm": _step(made, "light"),
+        "step_sound_mm": _step(made, "sound"),
+        "flatness_mm": _number(made["flatness_mm"]),
     }
 
 
-def _step(said: Evaluation, sense: str) -> float:
+def _step(made: Metrology, sense: str) -> float:
     """Root mean square error of the steps that rest on one sense."""
-    rows = said["metrology"]["steps_by_sense"]
+    rows = made["steps_by_sense"]
     return rows[sense]["rms_mm"] if sense in rows else NAN
 
 

@@ -77,8 +77,9 @@ def accumulate(points: Structured, field: MapField) -> OpticalGrid:
         steps = np.round(used["z_mm"].astype(np.float64) * STEPS_PER_MM).astype(np.int64)
         own_steps = np.round(used["sigma_z_mm"].astype(np.float64) * STEPS_PER_MM).astype(np.int64)
         cells, median, number = _median_per_cell(cell, steps)
-        deviation = np.abs(steps - median[np.searchsorted(cells, cell)])
-        spread = _median_per_cell(cell, deviation)[1] * SPREAD_OF_MAD / STEPS_PER_MM
+        twice = np.zeros(rows * columns, dtype=np.int64)  # a median may lie halfway between two steps
+        twice[cells] = np.round(2 * median)
+        spread = 0.5 * _median_per_cell(cell, np.abs(2 * steps - twice[cell]))[1] * SPREAD_OF_MAD / STEPS_PER_MM
         own_mm = _median_per_cell(cell, own_steps)[1] / STEPS_PER_MM
         height_mm[cells] = median / STEPS_PER_MM
         sigma_mm[cells] = np.maximum(LEAST_SIGMA_MM, 1.2533 * np.maximum(spread, own_mm) / np.sqrt(number))

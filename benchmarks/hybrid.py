@@ -171,8 +171,9 @@ def main() -> None:
     if kept:
         figures |= fusion_speed_rows(kept[0].evidence.calibration)
     if kept and (given.mismatch or given.full):
-        others = mismatch_rows(kept, rules)
-        for name, rows in others.items():
+        others: Table = {}
+        for name, rows in mismatch_rows(kept, rules):
+            others[name] = rows
             show(f"demo, {name}", rows, len(kept))
         figures |= beam_rows(others) | flat("mismatch", others)
     print(f"\n{'hybrid map, rule ' + DEFAULT:28}{'measured':>10}{'at least':>10}{'aim':>8}")

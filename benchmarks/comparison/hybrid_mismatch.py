@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import replace
 
 import msgspec
@@ -67,9 +67,8 @@ def noisier(ping: Ping, times: float) -> Ping:
     return replace(ping, echoes=np.clip(np.rint(ping.echoes + added), limits.min, limits.max).astype(np.int16))
 
 
-def mismatch_rows(scans: Sequence[Recorded], rules: Sequence[str]) -> dict[str, dict[str, Row]]:
-    """Figures by what was altered, then by rule, mean over the scans."""
-    found: dict[str, dict[str, Row]] = {}
+def mismatch_rows(scans: Sequence[Recorded], rules: Sequence[str]) -> Generator[tuple[str, dict[str, Row]]]:
+    """What was altered, and the figures by rule, mean over the scans."""
     for name, (kind, scale) in ARRAYS.items():
         rows: dict[str, list[Row]] = {rule: [] for rule in rules}
         for recorded in scans:
@@ -81,5 +80,4 @@ def mismatch_rows(scans: Sequence[Recorded], rules: Sequence[str]) -> dict[str, 
             points = np.concatenate([pipeline.process(p) for p in pings])
             for rule in rules:
                 rows[rule].append(row(fused(rule, recorded, calibration, pings, points)[0], recorded))
-        found[name] = {rule: mean_of(each) for rule, each in rows.items()}
-    return found
+        yield name, {rule: mean_of(each) for rule, each in rows.items()}

@@ -227,7 +227,7 @@ def test_relief_is_the_range_of_heights_within_a_disk() -> None:
     image = np.zeros((41, 41))
     image[20, 20] = 7.0
     y, x = np.mgrid[-20:21, -20:21]
-    np.testing.assert_array_equal(relief(image, 9.0), np.where(x**2 + y**2 <= 81, 7.0, 0.0))
+    np.testing.assert_array_equal(relief(image, 4.5, 0.5), np.where(x**2 + y**2 <= 81, 7.0, 0.0))
 
 
 def test_regions_are_wide_and_large() -> None:

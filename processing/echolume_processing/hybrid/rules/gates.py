@@ -52,7 +52,7 @@ def footprint_gate(scan: Scan) -> HybridMap:
     for hole in closed.absorbing:
         heard = hole & np.isfinite(scan.sound.height_mm)
         surface_mm[heard] = scan.sound.height_mm[heard]
-    relief_mm = relief(surface_mm, radius_mm / scan.field.cell_mm)
+    relief_mm = relief(surface_mm, radius_mm, scan.field.cell_mm)
     variance = scan.sound.sigma_mm**2 + SOUND_SIGMA_MM**2 + (0.5 * relief_mm) ** 2
     sound = SoundImage(scan.sound.height_mm, np.sqrt(variance))
     return gated(scan, closed, sound, whole=True).finish(f"footprint of {radius_mm:.1f} mm radius, {whence}")
@@ -66,11 +66,11 @@ def footprint_mm(array: ArrayCalibration) -> tuple[float, str]:
     return float(np.sqrt(wave_mm * array.reference_mm / 2)), "the first Fresnel zone: none was calibrated"
 
 
-def relief(height_mm: NDArray[np.float64], radius_cells: float) -> NDArray[np.float64]:
+def relief(height_mm: NDArray[np.float64], radius_mm: float, cell_mm: float) -> NDArray[np.float64]:
     """Highest less lowest height within a radius of each cell, of the image's shape."""
-    reach = max(1, round(radius_cells))
+    reach = max(1, round(radius_mm / cell_mm))
     y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
-    disk = (x**2 + y**2 <= radius_cells**2).astype(np.uint8)
+    disk = ((x**2 + y**2) * cell_mm**2 <= radius_mm**2).astype(np.uint8)
     disk[reach, reach] = 1
     image = np.ascontiguousarray(height_mm, dtype=np.float32)
     return np.asarray(cv2.dilate(image, disk) - cv2.erode(image, disk), dtype=np.float64)

@@ -11,6 +11,7 @@ import numpy as np
 from comparison.hybrid_scans import Recorded
 from comparison.hybrid_scores import Row, fused, mean_of, row
 from echolume_messages.calibration import ArrayCalibration, Calibration
+from echolume_processing.hybrid.rules.gates import footprint_mm
 from echolume_processing.ping import Ping
 from echolume_processing.ultrasonic.pipeline import UltrasonicPipeline
 
@@ -20,8 +21,8 @@ SIX_DB = 2.0
 
 
 def _beam(array: ArrayCalibration, scale: float) -> ArrayCalibration:
-    footprint = {"footprint_mm": array.footprint_mm * scale} if isinstance(array.footprint_mm, float) else {}
-    return msgspec.structs.replace(array, radius_mm=array.radius_mm / scale, **footprint)
+    footprint = footprint_mm(array)[0] * scale
+    return msgspec.structs.replace(array, radius_mm=array.radius_mm / scale, footprint_mm=footprint)
 
 
 def _speed(array: ArrayCalibration, scale: float) -> ArrayCalibration:

@@ -16,7 +16,7 @@ from echolume_processing.hybrid.digest import digest
 from echolume_processing.hybrid.fuse import fuse
 from echolume_processing.hybrid.grid import accumulate
 from echolume_processing.hybrid.model import HybridMap
-from echolume_processing.hybrid.rules.gates import footprint_mm, regions, relief
+from echolume_processing.hybrid.rules.gates import footprint_mm, regions, relief, slips
 from echolume_processing.hybrid.rules.names import DEFAULT, DESCRIPTIONS
 from echolume_processing.hybrid.rules.registry import RULES, fuse_by
 from echolume_processing.hybrid.rules.scan import DOUBTFUL_MM, sigma_of
@@ -264,3 +264,14 @@ def test_without_pings_the_forward_model_gate_says_so(scan: SmallScan, sound: St
     found = fuse_by("forward-model-gate", scan.optical, sound, (), scan.calibration, FIELD)
     assert found.notes == ("no pings: nothing was compared",)
     assert not (found.cells["label"] == Label.TRANSPARENT).any()
+
+
+def test_a_gate_says_that_a_narrow_band_slips_by_half_wavelengths(scan: SmallScan, maps: dict[str, HybridMap]) -> None:
+    array = msgspec.structs.replace(scan.calibration.array, low_hz=38e3, high_hz=42e3)
+    assert "n x 4.3" in slips(array)[0]
+    assert slips(scan.calibration.array) == ()
+    narrow = msgspec.structs.replace(scan.calibration, array=array)
+    flat = np.zeros(SQUARE.shape)
+    found = fuse_by("constant-gate", light_at(flat), sound_at(flat), (), narrow, SQUARE)
+    assert found.notes == slips(array)
+    assert maps["constant-gate"].notes == ()

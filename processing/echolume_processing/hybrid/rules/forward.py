@@ -14,7 +14,7 @@ from echolume_processing.hybrid import holes
 from echolume_processing.hybrid.grid import accumulate, cell_index
 from echolume_processing.hybrid.model import HybridMap, Registration, widened
 from echolume_processing.hybrid.predict import Band
-from echolume_processing.hybrid.rules.gates import GATE, SOUND_SIGMA_MM, regions, with_holes
+from echolume_processing.hybrid.rules.gates import GATE, SOUND_SIGMA_MM, regions, slips, with_holes
 from echolume_processing.hybrid.rules.scan import Scan, SoundImage, sound_image
 from echolume_processing.hybrid.sounding import Sounding, Spectra, register, sounding
 from echolume_processing.hybrid.surface import surface
@@ -55,7 +55,7 @@ def forward_model_gate(scan: Scan) -> HybridMap:
     sound = SoundImage(measured.height_mm, np.hypot(measured.sigma_mm, SOUND_SIGMA_MM))
     cells = with_holes(scan, closed, sound)
     cells.transparent(scan.light, sound.height_mm, sound.sigma_mm, regions(flagged, scan.field.cell_mm))
-    return cells.finish(registration=compared.registration)
+    return cells.finish(*slips(scan.calibration.array), registration=compared.registration)
 
 
 def compare(scan: Scan) -> Compared:

@@ -22,6 +22,8 @@ SOUND_SIGMA_MM = 1.0
 OCCLUDED_SIGMA_MM = 2.0
 REGION_MM = 9.0
 LEAST_MM2 = 150.0
+NARROW = 0.3
+"""Below this relative bandwidth a contact point may be off by whole half wavelengths."""
 """A square of this side fits into every part of a region, and it is at least this large."""
 
 
@@ -35,7 +37,7 @@ def constant_gate(scan: Scan) -> HybridMap:
     """
     closed = holes.close(scan.light)
     sigma_mm = np.full(scan.field.shape, SOUND_SIGMA_MM)
-    return gated(scan, closed, SoundImage(scan.sound.height_mm, sigma_mm)).finish()
+    return gated(scan, closed, SoundImage(scan.sound.height_mm, sigma_mm)).finish(*slips(scan.calibration.array))
 
 
 def footprint_gate(scan: Scan) -> HybridMap:
@@ -55,7 +57,16 @@ def footprint_gate(scan: Scan) -> HybridMap:
     relief_mm = relief(surface_mm, radius_mm, scan.field.cell_mm)
     variance = scan.sound.sigma_mm**2 + SOUND_SIGMA_MM**2 + (0.5 * relief_mm) ** 2
     sound = SoundImage(scan.sound.height_mm, np.sqrt(variance))
-    return gated(scan, closed, sound, whole=True).finish(f"footprint of {radius_mm:.1f} mm radius, {whence}")
+    note = f"footprint of {radius_mm:.1f} mm radius, {whence}"
+    return gated(scan, closed, sound, whole=True).finish(note, *slips(scan.calibration.array))
+
+
+def slips(array: ArrayCalibration) -> tuple[str, ...]:
+    """What a gate cannot know of heights from a narrow band."""
+    if array.high_hz - array.low_hz >= NARROW * array.low_hz:
+        return ()
+    half_wave_mm = 1e3 * array.speed_of_sound_mps / (array.low_hz + array.high_hz)
+    return (f"narrow band: heights found by sound may be off by n x {half_wave_mm:.2f} mm, and no gate can tell",)
 
 
 def footprint_mm(array: ArrayCalibration) -> tuple[float, str]:

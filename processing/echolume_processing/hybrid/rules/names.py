@@ -14,7 +14,7 @@ DESCRIPTIONS: Mapping[str, str] = {
     "inverse-variance": "light and the nearest contact point, weighted by their stated variances",
     "constant-gate": "sound of 1 mm standard deviation against light: what it finds higher is transparent",
     "footprint-gate": "the same, with what light says of the beam's footprint as variance, and only whole regions "
-    "(the safe choice)",
+    "(the safe choice with a wide band)",
     "forward-model-gate": "contact points of the measured echoes against those of the echoes that light predicts",
     SYNTHESIS: "echoes predicted from light, and explained by plates where they contradict it (the default)",
 }

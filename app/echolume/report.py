@@ -113,7 +113,7 @@ def table(report: Report) -> str:
     lines.append("")
     if "timing" in report:
         lines.append(_timing(report["timing"], report["resources"]["peak_pss_mib"]))
-    lines.append(f"Digest of the hybrid map: {report['digest']['hybrid']}")
+    lines.append(f"Rule: {report['rule']}. Digest of the hybrid map: {report['digest']['hybrid']}")
     lines.extend(f"Note: {note}" for note in report.get("notes", []))
     return "\n".join(lines) + "\n"
 

@@ -40,7 +40,7 @@ def scan_report(path: Path, results: Mapping[str, Any]) -> Report:
     path
         Raw archive of the scan.
     results
-        What the map came to: ``scan``, ``digest``, ``points``, ``cells``, ``notes``.
+        What the map came to: ``scan``, ``rule``, ``digest``, ``points``, ``cells``, ``notes``.
 
     Raises
     ------
@@ -52,6 +52,7 @@ def scan_report(path: Path, results: Mapping[str, Any]) -> Report:
     return {
         "version": version("echolume"),
         "scan": results["scan"],
+        "rule": results["rule"],
         "calibration": _calibration_row(start),
         "ledger": ledger_rows(ledger),
         "archive": {

@@ -21,8 +21,9 @@ from echolume_processing.export import npz
 from echolume_processing.hybrid import ply, recording
 from echolume_processing.hybrid.baselines import Baselines, baselines
 from echolume_processing.hybrid.digest import digest
-from echolume_processing.hybrid.fuse import fuse
 from echolume_processing.hybrid.model import HybridMap
+from echolume_processing.hybrid.rules import registry
+from echolume_processing.hybrid.rules.names import DEFAULT
 from echolume_processing.hybrid.stored import StoredMap
 from echolume_processing.optical.pipeline import OpticalPipeline
 from echolume_processing.ping import ping_from_record
@@ -38,6 +39,8 @@ class Results(TypedDict):
     """What a scan came to."""
 
     scan: str
+    rule: str
+    """How light and sound were fused."""
     digest: str
     files: list[str]
     points: dict[str, int]
@@ -50,7 +53,7 @@ def silent(what: str, done: int, total: int) -> None:
     """Progress for nobody."""
 
 
-def reprocess(archive: Path, out: Path, progress: Progress = silent) -> Results:
+def reprocess(archive: Path, out: Path, progress: Progress = silent, rule: str = DEFAULT) -> Results:
     """Rebuild the hybrid map of a scan from its raw archive, with the subscribers' own functions.
 
     Parameters
@@ -61,17 +64,22 @@ def reprocess(archive: Path, out: Path, progress: Progress = silent) -> Results:
         Folder for the map and its pictures; made if needed.
     progress
         Told what is going on.
+    rule
+        How light and sound are fused: a name of `hybrid.rules`.
 
     Raises
     ------
+    ConfigError
+        If there is no such rule.
     ArchiveError
         If it is no archive, or holds no start of a scan.
     CalibrationMissingError
         If the scan was made without a calibration.
     """
+    registry.named(rule)  # before the archive is read: that takes its time
     start = _start(archive)
     make_folder(out)
-    return conclude(gather(archive, progress, start), out, progress)[1]
+    return conclude(gather(archive, progress, start), out, progress, rule)[1]
 
 
 def gather(archive: Path, progress: Progress = silent, start: ScanStart | None = None) -> Evidence:
@@ -126,13 +134,16 @@ def gather(archive: Path, progress: Progress = silent, start: ScanStart | None =
     return evidence
 
 
-def conclude(evidence: Evidence, out: Path, progress: Progress = silent) -> tuple[HybridMap, Results]:
+def conclude(
+    evidence: Evidence, out: Path, progress: Progress = silent, rule: str = DEFAULT
+) -> tuple[HybridMap, Results]:
     """Fuse gathered evidence and write the map: ``hybrid.ply``, ``map.npz``, ``hybrid.rrd``, ``figures/*.png``."""
     out.mkdir(parents=True, exist_ok=True)
     progress("fusing", 0, 3)
     optical, ultrasonic = evidence.all_optical(), evidence.all_ultrasonic()
-    found = fuse(optical, evidence.all_pings(), evidence.calibration, evidence.plan.map)
-    others = baselines(optical, ultrasonic, evidence.plan.map)
+    pings, field = evidence.all_pings(), evidence.plan.map
+    found = registry.fuse_by(rule, optical, ultrasonic, pings, evidence.calibration, field)
+    others = baselines(optical, ultrasonic, field)
     progress("writing", 1, 3)
     calibration = evidence.calibration.digest
     ply.write(found, out / "hybrid.ply", evidence.scan, calibration)
@@ -144,6 +155,7 @@ def conclude(evidence: Evidence, out: Path, progress: Progress = silent) -> tupl
     labels = np.bincount(found.cells["label"], minlength=5)
     results = Results(
         scan=evidence.scan,
+        rule=rule,
         digest=digest(found),
         files=["hybrid.rrd", "hybrid.ply", "map.npz", *(f"figures/{path.name}" for path in drawn)],
         points=evidence.counts(),

@@ -29,7 +29,7 @@ def scores(f1: float) -> dict[str, float | None]:
 
 def report() -> dict[str, Any]:
     return {
-        "version": "0", "scan": "s", "seed": 1,
+        "version": "0", "scan": "s", "rule": "synthesis", "seed": 1,
         "calibration": {"digest": "d", "left_rms_px": 0.1, "right_rms_px": 0.1, "stereo_rms_px": 0.1,
                         "plane_rms_mm": 0.1},
         "ledger": {"optical": dict(LEDGER_ROW), "ultrasonic": dict(LEDGER_ROW)},

@@ -53,6 +53,16 @@ def test_points_outside_the_field_and_points_without_a_height_are_left_out() -> 
     assert grid.count.sum() == 0
 
 
+def test_one_absurd_height_leaves_the_other_cells_as_they_are() -> None:
+    rng = np.random.default_rng(4)
+    rows = [(x, y, z, OpticalSource.STEREO) for x, y, z in zip(*rng.uniform(0, 3, (3, 60)), strict=True)]
+    one = accumulate(optical(rows), FIELD)
+    two = accumulate(optical([*rows, (3.5, 0.5, 4e15, OpticalSource.STEREO)]), FIELD)
+    np.testing.assert_array_equal(two.height_mm[:, :3], one.height_mm[:, :3])
+    np.testing.assert_array_equal(two.sigma_mm[:, :3], one.sigma_mm[:, :3])
+    assert two.height_mm[0, 3] > 3.9e15
+
+
 def test_no_points_make_an_empty_grid() -> None:
     assert np.isnan(accumulate(np.zeros(0, dtype=OPTICAL_POINT), FIELD).height_mm).all()
 

@@ -167,6 +167,16 @@ def test_an_archive_gives_a_map_and_every_file_that_it_names(reprocessed: tuple[
         assert plyfile.PlyData.read(str(out / "hybrid.ply"))["vertex"].count == claimed.sum()
 
 
+def test_the_rule_is_named_and_another_one_gives_another_map(
+    recorded: Recorded, reprocessed: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    alone = reprocess(recorded.archive, tmp_path, rule="ultrasonic")
+    assert (reprocessed[1]["rule"], alone["rule"]) == ("synthesis", "ultrasonic")
+    assert alone["digest"] != reprocessed[1]["digest"]
+    with np.load(tmp_path / "map.npz") as maps:
+        np.testing.assert_array_equal(maps["front_mm"], maps["ultrasonic_mm"])
+
+
 def test_the_recording_holds_points_map_and_notes(reprocessed: tuple[Path, dict[str, Any]], evidence: Evidence) -> None:
     reader = RrdReader(reprocessed[0] / "hybrid.rrd")
     assert [store.application_id for store in reader.recordings()] == ["echolume"]

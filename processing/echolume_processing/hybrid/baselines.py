@@ -48,16 +48,29 @@ def baselines(optical: Structured, ultrasonic: Structured, field: MapField) -> B
 def nearest(points: Structured, field: MapField) -> NDArray[np.float64]:
     """Height of the nearest ultrasonic contact point at each cell within `NEAREST_MM`, else nan."""
     out = np.full(field.shape, np.nan)
-    points = np.sort(points, order=["x_mm", "y_mm", "z_mm"])
+    ordered, index = nearest_points(points, field)
+    found = index < ordered.size
+    out[found] = ordered["z_mm"][index[found]]
+    return out
+
+
+def nearest_points(points: Structured, field: MapField) -> tuple[Structured, NDArray[np.int64]]:
+    """Which ultrasonic contact point is the nearest to each cell.
+
+    Returns
+    -------
+    ordered, index
+        The points that have a place (m,), in an order of their own that no order of arrival changes; and for each cell
+        (rows, columns) the nearest of them, m where none is within `NEAREST_MM`.
+    """
     points = points[np.isfinite(points["z_mm"]) & np.isfinite(points["x_mm"]) & np.isfinite(points["y_mm"])]
+    points = points[np.lexsort([points[name] for name in ("zz_mm2", "z_mm", "y_mm", "x_mm")])]
     if not points.size:
-        return out
+        return points, np.zeros(field.shape, dtype=np.int64)
     x_mm, y_mm = np.meshgrid(*cell_centres_mm(field))
     known = NearestPoints(np.column_stack((points["x_mm"], points["y_mm"])).astype(np.float64))
     _, index = known.nearest(np.column_stack((x_mm.ravel(), y_mm.ravel())), NEAREST_MM)
-    found = index < points.size
-    out.ravel()[found] = points["z_mm"][index[found]]
-    return out
+    return points, index.reshape(field.shape)
 
 
 def union(optical: Structured, ultrasonic: Structured, field: MapField) -> NDArray[np.float64]:

@@ -141,7 +141,9 @@ def resolve_cycles(
     score = (heard - 3) * surface + envelopes
     order = np.argsort(score, kind="stable")
     best = int(order[0])
-    margin = float(score[order[1]] - score[best]) if len(order) > 1 else np.inf
+    margin = np.inf
+    if len(order) > 1:
+        margin = float(score[order[1]] - score[best]) if np.isfinite(score[best]) else 0.0
     believed = bool(surface[best] <= MAX_CHI_SQUARED)
     kind = EchoKind(int(fits.kind[best])) if believed else EchoKind.NONE
     return Cycles(whole[best], ways[best], kind, float(surface[best]), margin)

@@ -1,0 +1,1 @@
+"""The ways to make one map of light and sound, each by its name."""

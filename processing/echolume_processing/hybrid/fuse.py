@@ -24,7 +24,7 @@ from echolume_processing.hybrid.hypotheses import (
     seeds_by_height,
     vanished,
 )
-from echolume_processing.hybrid.model import HybridMap, Registration, cell_centres_mm
+from echolume_processing.hybrid.model import HybridMap, Registration, cell_centres_mm, window_of
 from echolume_processing.hybrid.scipy_typed import Mask, NearestPoints
 from echolume_processing.hybrid.sounding import register, sounding
 from echolume_processing.hybrid.state import State, cells_near, pings_near
@@ -37,6 +37,8 @@ ANOMALOUS_TIMES = 6.0
 """And it must be so many times that of the better pings, or the model as a whole is at fault."""
 BETTER = 0.25
 """The better pings are this share of all: a scene may be mostly glass."""
+NEVER_AGREES = 0.7
+"""A ping of which so much is unexplained contradicts the surface, however bad the others are."""
 PLATES = 12
 """So many surfaces are sought at most."""
 OFF_SURFACE_MM = 1.5
@@ -47,7 +49,7 @@ UNEXPLAINED_MM = 5.0
 AGREES_MM = 10.0
 """A ping confirms what lies this near to its foot."""
 SHARED = 0.05
-"""Share of the swept cells that light must have seen to register sound to it."""
+"""Share of the map that light must have seen to register sound to it."""
 
 
 def fuse(optical: Structured, pings: Sequence[Ping], calibration: Calibration, field: MapField) -> HybridMap:
@@ -88,7 +90,7 @@ def fuse(optical: Structured, pings: Sequence[Ping], calibration: Calibration, f
     spoken = heard(ordered, calibration.array)
     scene = surface(closed.height_mm, wide)
     predicted = found.predict(scene, np.arange(len(found.apertures)))
-    shared = float(closed.seen.sum() / max(1, (~closed.outside).sum()))
+    shared = float(closed.seen[window_of(wide, field)].mean())
     registration = Registration()
     if shared >= SHARED:
         found, predicted, registration = register(found, predicted)
@@ -141,7 +143,8 @@ def _find_plates(state: State, cells: Cells, spoken: Heard) -> None:
 def _contradicting(state: State) -> NDArray[np.bool_]:
     """Pings whose echoes are not those of the surface, (pings,)."""
     residual = state.residual()
-    return residual > max(ANOMALOUS, ANOMALOUS_TIMES * float(np.quantile(residual, BETTER)))
+    limit = max(ANOMALOUS, ANOMALOUS_TIMES * float(np.quantile(residual, BETTER)))
+    return residual > min(limit, NEVER_AGREES)
 
 
 def _next_plate(

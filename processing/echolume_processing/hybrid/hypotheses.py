@@ -38,6 +38,7 @@ LEAST_MM2 = 150.0
 LEAST_RISE_MM = 1.5
 NEIGHBOUR_MM = 14.0
 """Cells this near to where a ping met a plate may belong to it."""
+GROWS = 3
 SNAP_MM = 4.0
 """Between the rim of a dark surface as sound sees it and as light does may lie so much."""
 DARK_SHARE = 0.5
@@ -124,12 +125,7 @@ def plate(state: State, seed: Seed, dark: Mask) -> tuple[Patch, State] | None:
         Where light returned nothing.
     """
     found, field = state.found, state.scene.field
-    window = cells_near(seed.place_mm, field, NEIGHBOUR_MM)
-    judges = pings_near(found, window, field, JUDGED_MM, seed.plane)
-    share = occupancy(
-        found, state.scene, state.predicted[judges], judges, seed.plane, tiles := tiles_over(window)
-    ).share
-    mask = _largest(covered(share, tiles, window.shape, field.cell_mm))
+    mask, judges = _extent(state, seed)
     if mask.sum() * field.cell_mm**2 < LEAST_MM2:
         return None
     plane, ambiguous = _settle(state, mask, [seed.plane], seed.which)
@@ -139,14 +135,35 @@ def plate(state: State, seed: Seed, dark: Mask) -> tuple[Patch, State] | None:
     is_dark = bool((mask & dark).sum() >= DARK_SHARE * mask.sum())
     if is_dark:
         mask = dark & (distance_to(mask) * field.cell_mm <= SNAP_MM)
-    believed = state.with_patch(mask, plane)
+    ways = [(hangs, state.with_patch(mask, plane, hangs=hangs)) for hangs in (False, True)]
     before = residual_of(found, state.predicted[judges], judges)
-    if residual_of(found, believed.predicted[judges], judges) >= ACCEPTED * before:
+    after = [residual_of(found, believed.predicted[judges], judges) for _, believed in ways]
+    hangs, believed = ways[int(np.argmin(after))]
+    if min(after) >= ACCEPTED * before:
         return None
     if not is_dark:
         mask = _rim(state, believed, mask, plane, judges)
-        believed = state.with_patch(mask, plane)
+        believed = state.with_patch(mask, plane, hangs=hangs)
     return Patch(mask, plane, seed.sigma_mm, int(seed.which.size), ambiguous, is_dark), believed
+
+
+def _extent(state: State, seed: Seed) -> tuple[Mask, NDArray[np.int64]]:
+    """Cells that a plate in the plane of a seed covers, and the pings that judge it.
+
+    Sought around where pings met it, and further on as long as it reaches the end of what was searched.
+    """
+    found, field = state.found, state.scene.field
+    window = cells_near(seed.place_mm, field, NEIGHBOUR_MM)
+    for _ in range(GROWS):
+        judges = pings_near(found, window, field, JUDGED_MM, seed.plane)
+        tiles = tiles_over(window)
+        share = occupancy(found, state.scene, state.predicted[judges], judges, seed.plane, tiles).share
+        mask = _largest(covered(share, tiles, window.shape, field.cell_mm))
+        further = window | (distance_to(mask) * field.cell_mm <= NEIGHBOUR_MM)
+        if (further & ~window).sum() * field.cell_mm**2 < LEAST_MM2 or not mask.any():
+            break
+        window = further
+    return mask, judges
 
 
 def _rim(state: State, believed: State, mask: Mask, plane: Plane, judges: NDArray[np.int64]) -> Mask:

@@ -31,13 +31,14 @@ class State:
         """Residual energy of each ping over its measured energy."""
         return self.found.residual(self.predicted, np.arange(len(self.found.apertures)))
 
-    def scene_with(self, mask: Mask, plane: Plane, near: Surface | None = None) -> Surface:
-        """The surface with a plane within a mask; `near` is one that is almost the same."""
-        return reshaped(near or self.scene, np.where(mask, plane.image(self.scene.field), self.scene.height_mm))
+    def scene_with(self, mask: Mask, plane: Plane, near: Surface | None = None, *, hangs: bool = False) -> Surface:
+        """The surface with a plane within a mask, on sides or hanging; `near` is one that is almost the same."""
+        height_mm = np.where(mask, plane.image(self.scene.field), self.scene.height_mm)
+        return reshaped(near or self.scene, height_mm, mask if hangs else None)
 
-    def with_patch(self, mask: Mask, plane: Plane) -> State:
+    def with_patch(self, mask: Mask, plane: Plane, *, hangs: bool = False) -> State:
         """The state with a plane within a mask; only the pings that can notice are predicted anew."""
-        scene = self.scene_with(mask, plane)
+        scene = self.scene_with(mask, plane, hangs=hangs)
         which = pings_near(self.found, mask, scene.field, NOTICED_MM, plane)
         predicted = self.predicted.copy()
         if which.size:

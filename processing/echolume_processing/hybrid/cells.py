@@ -17,8 +17,8 @@ MARGIN_MM = 80.0
 """Sound sees this far beyond the map."""
 OCCLUDED_SIGMA_MM = 2.0
 CONFIRMED_SIGMA_MM = 0.5
-RIM_MM = 1.0
-"""The doubt which side of a rim a cell lies on falls by e over this distance."""
+RIM_MM, RIM_REACH_MM = 0.6, 6.0
+"""The doubt which side of a rim a cell lies on falls by e over the first, and ends at the second."""
 BESIDE_MM = 3.0
 BESIDE_PER_RISE = 0.6
 """Beside the rim of a plate light is missing as far as `BESIDE_MM`, and this more for each millimetre that it is up:
@@ -84,7 +84,7 @@ class Cells:
             up_mm = float(np.median(rise_mm[mask]))
             self._beside |= away <= BESIDE_MM + BESIDE_PER_RISE * up_mm
         off_mm = np.where(mask, depth_inside(mask) * self.wide.cell_mm, away) - 0.5 * self.wide.cell_mm
-        other = 0.5 * np.exp(-off_mm / RIM_MM)
+        other = np.where(off_mm < RIM_REACH_MM, 0.5 * np.exp(-off_mm / RIM_MM), 0.0)
         self._doubt_mm2 += other * (1 - other) * rise_mm**2
 
     def confirm(self, mask: Mask, height_mm: NDArray[np.float64], pings: int) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echolume_processing.hybrid.heard import Heard, Seed, seeds
+from echolume_processing.hybrid.outline import straightened
 from echolume_processing.hybrid.plates import Plane, fit_plane, ping_heights
 from echolume_processing.hybrid.scipy_typed import Mask, NearestPoints, depth_inside, distance_to, labelled
 from echolume_processing.hybrid.sounding import Sounding
@@ -39,6 +40,8 @@ LEAST_RISE_MM = 1.5
 NEIGHBOUR_MM = 14.0
 """Cells this near to where a ping met a plate may belong to it."""
 GROWS = 3
+END_MM, LEAST_AT_END_MM2 = 3.0, 40.0
+"""A plate of which so much lies so near to the end of what was searched may reach further."""
 SNAP_MM = 4.0
 """Between the rim of a dark surface as sound sees it and as light does may lie so much."""
 DARK_SHARE = 0.5
@@ -51,6 +54,8 @@ RIM_MM = 6.0
 RIM_SMOOTHING = 0.05
 VANISHED = 0.8
 """Missing echoes must bring the residual energy below this share of what it was."""
+STRAIGHT = 1.02
+"""An outline with straight sides may leave so much more over."""
 NARROW = 0.3
 """Below this relative bandwidth a height is only known up to half a wavelength, unless the echoes say more."""
 RIVAL = 1.15
@@ -144,6 +149,7 @@ def plate(state: State, seed: Seed, dark: Mask) -> tuple[Patch, State] | None:
     if not is_dark:
         mask = _rim(state, believed, mask, plane, judges)
         believed = state.with_patch(mask, plane, hangs=hangs)
+        mask, believed = _straight(state, believed, mask, plane, judges)
     return Patch(mask, plane, seed.sigma_mm, int(seed.which.size), ambiguous, is_dark), believed
 
 
@@ -159,10 +165,10 @@ def _extent(state: State, seed: Seed) -> tuple[Mask, NDArray[np.int64]]:
         tiles = tiles_over(window)
         share = occupancy(found, state.scene, state.predicted[judges], judges, seed.plane, tiles).share
         mask = _largest(covered(share, tiles, window.shape, field.cell_mm))
-        further = window | (distance_to(mask) * field.cell_mm <= NEIGHBOUR_MM)
-        if (further & ~window).sum() * field.cell_mm**2 < LEAST_MM2 or not mask.any():
+        at_end = mask & (distance_to(~window) * field.cell_mm <= END_MM)
+        if at_end.sum() * field.cell_mm**2 < LEAST_AT_END_MM2:
             break
-        window = further
+        window |= distance_to(at_end) * field.cell_mm <= NEIGHBOUR_MM
     return mask, judges
 
 
@@ -183,6 +189,17 @@ def _rim(state: State, believed: State, mask: Mask, plane: Plane, judges: NDArra
     coarse[at] = share[tiles.grid[at]]
     fine = _largest(without_pinholes(tiles.fine(coarse, mask.shape) > 0.5, field.cell_mm))
     return fine if fine.any() else mask
+
+
+def _straight(state: State, believed: State, mask: Mask, plane: Plane, judges: NDArray[np.int64]) -> tuple[Mask, State]:
+    """The mask with straight sides that meet in corners, and the state with it, if the echoes do not object."""
+    straight = straightened(mask, state.scene.field.cell_mm)
+    if not straight.any() or np.array_equal(straight, mask):
+        return mask, believed
+    hangs = believed.scene.hanging is not state.scene.hanging
+    other = state.with_patch(straight, plane, hangs=hangs)
+    before, after = (residual_of(state.found, s.predicted[judges], judges) for s in (believed, other))
+    return (straight, other) if after <= STRAIGHT * before else (mask, believed)
 
 
 def seeds_by_height(found: Sounding, cluster: NDArray[np.int64]) -> list[Seed]:

@@ -19,7 +19,6 @@ from echolume_processing.hybrid.hypotheses import (
     Patch,
     absorbing,
     clusters,
-    is_narrow,
     plate,
     seeds_by_height,
     vanished,
@@ -164,9 +163,9 @@ def _next_plate(
 
 
 def _by_height(state: State, odd: NDArray[np.int64]) -> list[Seed]:
-    """Seeds where no contact can be told: in a narrow band."""
+    """Seeds where contacts tell no plane, as in a narrow band or with receivers a little off their places."""
     regions = clusters(state.found, odd)
-    return seeds_by_height(state.found, regions[0]) if regions and is_narrow(state.found) else []
+    return seeds_by_height(state.found, regions[0]) if regions else []
 
 
 def _off_surface(state: State, spoken: Heard) -> NDArray[np.bool_]:

@@ -8,8 +8,10 @@ import pytest
 from scipy import ndimage
 
 from echolume_drivers.emulated import scene_file
+from echolume_drivers.emulated.array_truth import array_truth
 from echolume_drivers.emulated.scene import Material, SceneBuilder
 from echolume_messages.calibration import Calibration
+from echolume_messages.rig import ArraySettings
 from echolume_messages.types import OPTICAL_POINT, Label, Provenance
 from echolume_processing.hybrid import kernels, surface, tiles
 from echolume_processing.hybrid.digest import digest
@@ -120,7 +122,10 @@ def test_a_tilted_plate_with_a_hole_is_found_with_its_slope_and_its_hole() -> No
         seed=3,
         pitch_mm=10.0,
     )
-    found = fuse(scan.optical, scan.pings, scan.calibration, FIELD)
+    array = scan.calibration.array
+    places = np.array(array.receivers_mm) + array_truth(3, ArraySettings(port="")).placement_mm
+    array = msgspec.structs.replace(array, receivers_mm=[tuple(place) for place in places.tolist()])
+    found = fuse(scan.optical, scan.pings, msgspec.structs.replace(scan.calibration, array=array), FIELD)
     glass = cut(scan.scene.material) == Material.GLASS
     named = found.image("label") == Label.TRANSPARENT
     assert (glass & named).sum() / glass.sum() > 0.9

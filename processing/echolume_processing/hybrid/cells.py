@@ -59,9 +59,14 @@ class Cells:
         """Dark cells of which nothing is known yet."""
         return self.dark & ~self._patched & ~self._given_up
 
+    @property
+    def beside(self) -> Mask:
+        """Cells beside the rim of a transparent plate, of which sound has not said anything."""
+        return self._beside & ~self._patched
+
     def put(self, patch: Patch, below_mm: NDArray[np.float64]) -> None:
         """A surface that sound found above heights believed before."""
-        kind = "dark" if patch.dark else "transparent"
+        kind = "dark" if patch.label == Label.ABSORBING else "transparent"
         if patch.ambiguous:
             self.unknown(
                 patch.mask,
@@ -72,12 +77,12 @@ class Cells:
         self._patched |= mask
         view["front_mm"][mask] = height_mm[mask]
         view["sigma_mm"][mask] = patch.sigma_mm
-        view["label"][mask] = Label.ABSORBING if patch.dark else Label.TRANSPARENT
+        view["label"][mask] = patch.label
         view["provenance"][mask] = Provenance.ULTRASONIC
         view["ultrasonic_n"][mask] = min(patch.pings, _COUNT_LIMIT)
         rise_mm = height_mm - below_mm
         away = distance_to(mask) * self.wide.cell_mm
-        if not patch.dark:
+        if patch.label == Label.TRANSPARENT:
             view["behind_mm"][mask] = self._optical_mm[mask]
             lit = mask & self._seen
             view["provenance"][lit] |= self._grid.provenance[lit]

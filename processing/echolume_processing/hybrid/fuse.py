@@ -18,6 +18,7 @@ from echolume_processing.hybrid.heard import Heard, Seed, heard, seeds
 from echolume_processing.hybrid.hypotheses import (
     Patch,
     absorbing,
+    bent,
     clusters,
     plate,
     seeds_by_height,
@@ -133,10 +134,22 @@ def _find_plates(state: State, cells: Cells, spoken: Heard) -> None:
         cells.put(patch, state.scene.height_mm)
         state = after
         settled[_inside(state, patch)] = True
+    if cells.beside.any():
+        state = _straighten(state, cells, spoken)
     odd = _contradicting(state)
     for cluster in clusters(state.found, np.nonzero(odd & ~settled)[0]):
         _unexplained(state, cluster, cells)
     _judge_dark(state, cells, odd)
+
+
+def _straighten(state: State, cells: Cells, spoken: Heard) -> State:
+    """Beside plates, give the ground that light sees bent the height that sound finds."""
+    for seed in seeds(spoken, np.nonzero(_contradicting(state))[0]):
+        chosen = bent(state, seed, cells.beside)
+        if chosen is not None:
+            cells.put(chosen[0], state.scene.height_mm)
+            state = chosen[1]
+    return state
 
 
 def _contradicting(state: State) -> NDArray[np.bool_]:

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from echolume_messages.types import Label
 from echolume_processing.hybrid.heard import Heard, Seed, seeds
 from echolume_processing.hybrid.outline import straightened
 from echolume_processing.hybrid.plates import Plane, fit_plane, ping_heights
-from echolume_processing.hybrid.scipy_typed import Mask, NearestPoints, depth_inside, distance_to, labelled
+from echolume_processing.hybrid.scipy_typed import Mask, NearestPoints, depth_inside, distance_to, labelled, opened
 from echolume_processing.hybrid.sounding import Sounding
 from echolume_processing.hybrid.state import State, cells_near, centres_mm, pings_inside, pings_near, residual_of
 from echolume_processing.hybrid.tiles import covered, occupancy, tiles_over, without_pinholes
@@ -33,12 +34,18 @@ STEP_MM = 0.3
 """Step of the parabola through three heights."""
 ACCEPTED = 0.6
 """A surface must bring the residual energy below this share of what it was."""
+INSIDE_LEFT = 0.45
+"""Over a plate's own cells no more than this of the measured energy may be left over."""
+CLOSE_MM = 2.0
+"""Pings whose own height is this near to a plane may have met it."""
 LEVEL_FIRST = 0.95
 """A tilted plane must explain so much better than a level one."""
 LEAST_MM2 = 150.0
 LEAST_RISE_MM = 1.5
 NEIGHBOUR_MM = 14.0
 """Cells this near to where a ping met a plate may belong to it."""
+BENT_MM = (0.3, 4.0)
+"""Through a plate a camera sees the ground too high by so much."""
 GROWS = 3
 END_MM, LEAST_AT_END_MM2 = 3.0, 40.0
 """A plate of which so much lies so near to the end of what was searched may reach further."""
@@ -48,6 +55,8 @@ DARK_SHARE = 0.5
 """A surface that light is missing over so much of is not one that light goes through."""
 KEPT = 0.3
 """Cells of a hole of which sound finds less than this covered do not belong to the surface in it."""
+SHADOW_MM = 3.0
+"""Narrower strips of such cells are within what sound resolves."""
 RIM_CELLS = 2
 RIM_MM = 6.0
 """The rim of a plate is sought again so far in and out, with tiles of so many cells."""
@@ -72,8 +81,9 @@ class Patch:
     pings: int
     ambiguous: bool
     """Another height, half a wavelength off, explains the echoes as well."""
-    dark: bool
-    """Light returned nothing from most of it."""
+    label: Label
+    """Absorbing: light returned nothing from most of it; transparent: light goes through; matte: light sees it, bent by
+    a plate beside it."""
 
 
 def absorbing(state: State, hole: Mask, heard: Heard) -> Patch | None:
@@ -102,7 +112,7 @@ def absorbing(state: State, hole: Mask, heard: Heard) -> Patch | None:
     off_mm = heights.height_mm - plane.at(centre[:, 0], centre[:, 1])
     spread_mm = seen[0].spread_mm if seen else 1.4826 * float(np.median(np.abs(off_mm)))
     sigma_mm = max(0.05, spread_mm / float(np.sqrt(over.size)))
-    return Patch(mask, plane, sigma_mm, int(over.size), ambiguous, True)
+    return Patch(mask, plane, sigma_mm, int(over.size), ambiguous, Label.ABSORBING)
 
 
 def _within(state: State, hole: Mask, plane: Plane) -> Mask:
@@ -113,8 +123,8 @@ def _within(state: State, hole: Mask, plane: Plane) -> Mask:
     judges = pings_near(state.found, hole, field, JUDGED_MM, plane)
     tiles = tiles_over(distance_to(hole) * field.cell_mm <= SNAP_MM)
     share = occupancy(state.found, state.scene, state.predicted[judges], judges, plane, tiles).share
-    kept = hole & (tiles.fine(np.where(tiles.grid >= 0, share[tiles.grid], 0.0), hole.shape) > KEPT)
-    return without_pinholes(kept, field.cell_mm) & hole
+    bare = hole & (tiles.fine(np.where(tiles.grid >= 0, share[tiles.grid], 0.0), hole.shape) < KEPT)
+    return hole & ~opened(bare, max(1, round(SHADOW_MM / field.cell_mm)))
 
 
 def plate(state: State, seed: Seed, dark: Mask) -> tuple[Patch, State] | None:
@@ -150,7 +160,32 @@ def plate(state: State, seed: Seed, dark: Mask) -> tuple[Patch, State] | None:
         mask = _rim(state, believed, mask, plane, judges)
         believed = state.with_patch(mask, plane, hangs=hangs)
         mask, believed = _straight(state, believed, mask, plane, judges)
-    return Patch(mask, plane, seed.sigma_mm, int(seed.which.size), ambiguous, is_dark), believed
+    inside = pings_near(found, mask, field, 0.0, plane)
+    if inside.size and residual_of(found, believed.predicted[inside], inside) > INSIDE_LEFT:
+        return None
+    label = Label.ABSORBING if is_dark else Label.TRANSPARENT
+    return Patch(mask, plane, seed.sigma_mm, int(seed.which.size), ambiguous, label), believed
+
+
+def bent(state: State, seed: Seed, beside: Mask) -> tuple[Patch, State] | None:
+    """The ground where light sees it too high, bent by a plate beside it, and the state with it; None if it is not so.
+
+    Parameters
+    ----------
+    beside
+        Cells near to the rim of a plate, of which sound has not said anything.
+    """
+    found, field = state.found, state.scene.field
+    too_high_mm = state.scene.height_mm - seed.plane.image(field)
+    near = cells_near(seed.place_mm, field, NEIGHBOUR_MM)
+    mask = near & beside & (too_high_mm > BENT_MM[0]) & (too_high_mm < BENT_MM[1])
+    if mask.sum() * field.cell_mm**2 < LEAST_MM2:
+        return None
+    believed = state.with_patch(mask, seed.plane)
+    before, after = (residual_of(found, s.predicted[seed.which], seed.which) for s in (state, believed))
+    if after >= ACCEPTED * before:
+        return None
+    return Patch(mask, seed.plane, seed.sigma_mm, int(seed.which.size), False, Label.MATTE), believed
 
 
 def _extent(state: State, seed: Seed) -> tuple[Mask, NDArray[np.int64]]:
@@ -160,6 +195,7 @@ def _extent(state: State, seed: Seed) -> tuple[Mask, NDArray[np.int64]]:
     """
     found, field = state.found, state.scene.field
     window = cells_near(seed.place_mm, field, NEIGHBOUR_MM)
+    mask, judges = np.zeros_like(window), seed.which
     for _ in range(GROWS):
         judges = pings_near(found, window, field, JUDGED_MM, seed.plane)
         tiles = tiles_over(window)
@@ -210,8 +246,11 @@ def seeds_by_height(found: Sounding, cluster: NDArray[np.int64]) -> list[Seed]:
         plane = fit_plane(found, heights, tilted)
         if tilted and plane.slope_x == plane.slope_y == 0.0:
             continue
-        off_mm = heights.height_mm - plane.at(centre[:, 0], centre[:, 1])
-        out.append(Seed(plane, cluster, found.foot_mm[cluster], 1.4826 * float(np.median(np.abs(off_mm)))))
+        off_mm = np.abs(heights.height_mm - plane.at(centre[:, 0], centre[:, 1]))
+        close = off_mm <= CLOSE_MM
+        if close.sum() >= LEAST_PINGS:
+            spread_mm = 1.4826 * float(np.median(off_mm[close]))
+            out.append(Seed(plane, cluster[close], found.foot_mm[cluster], spread_mm))
     return out
 
 

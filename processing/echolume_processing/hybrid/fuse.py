@@ -138,8 +138,8 @@ def _find_plates(state: State, cells: Cells, spoken: Heard) -> None:
         state = _straighten(state, cells, spoken)
     odd = _contradicting(state)
     for cluster in clusters(state.found, np.nonzero(odd & ~settled)[0]):
-        _unexplained(state, cluster, cells)
-    _judge_dark(state, cells, odd)
+        state = _unexplained(state, cluster, cells)
+    _judge_dark(state, cells, _contradicting(state))
 
 
 def _straighten(state: State, cells: Cells, spoken: Heard) -> State:
@@ -211,7 +211,7 @@ def _judge_dark(state: State, cells: Cells, odd: NDArray[np.bool_]) -> None:
     cells.note(cells.open, "a dark region of {cells} cells stays unknown: no echo fits it")
 
 
-def _unexplained(state: State, cluster: NDArray[np.int64], cells: Cells) -> None:
+def _unexplained(state: State, cluster: NDArray[np.int64], cells: Cells) -> State:
     """No plate explains these pings: the cells whose echo is missing, or else those right below, are unknown."""
     foot = state.found.foot_mm[cluster]
     where = f"around x {foot[:, 0].mean():.0f}, y {foot[:, 1].mean():.0f} mm"
@@ -220,9 +220,10 @@ def _unexplained(state: State, cluster: NDArray[np.int64], cells: Cells) -> None
         cells.unknown(
             missing, f"the echo of {{cells}} cells {where} is missing: something hides them from sound; unknown"
         )
-        return
+        return state.without(missing)
     mask = cells_near(foot, state.scene.field, UNEXPLAINED_MM)
     cells.unknown(mask, f"light and sound disagree in {{cells}} cells {where}, and no plate explains it: unknown")
+    return state
 
 
 def _limits(calibration: Calibration) -> tuple[str, ...]:

@@ -101,7 +101,8 @@ def absorbing(state: State, hole: Mask, heard: Heard) -> Patch | None:
     seen = seeds(heard, over)[:1]
     planes = [*level, fit_plane(found, heights, True), *(seed.plane for seed in seen)]
     plane, ambiguous = _settle(state, hole, planes, judges)
-    near = cells_near(plane.mirror_points(centres_mm(found)[over]), field, NEIGHBOUR_MM)
+    any_over = pings_inside(found, hole, field, 0.0)
+    near = cells_near(plane.mirror_points(centres_mm(found)[any_over]), field, NEIGHBOUR_MM)
     mask = _within(state, hole & near, plane)
     if mask.sum() * field.cell_mm**2 < LEAST_MM2 / 2:
         return None
@@ -160,7 +161,7 @@ def plate(state: State, seed: Seed, dark: Mask) -> tuple[Patch, State] | None:
         mask = _rim(state, believed, mask, plane, judges)
         believed = state.with_patch(mask, plane, hangs=hangs)
         mask, believed = _straight(state, believed, mask, plane, judges)
-    inside = pings_near(found, mask, field, 0.0, plane)
+    inside = pings_inside(found, mask, field, 0.0, plane)
     if inside.size and residual_of(found, believed.predicted[inside], inside) > INSIDE_LEFT:
         return None
     label = Label.ABSORBING if is_dark else Label.TRANSPARENT

@@ -13,7 +13,7 @@ from echolume_processing.hybrid.model import cell_centres_mm
 from echolume_processing.hybrid.plates import Plane
 from echolume_processing.hybrid.scipy_typed import Mask, NearestPoints, depth_inside
 from echolume_processing.hybrid.sounding import Sounding, Spectra
-from echolume_processing.hybrid.surface import Surface, reshaped
+from echolume_processing.hybrid.surface import Surface, reshaped, without_echo
 
 NOTICED_MM = 50.0
 """Pings of which foot and mirror point are further than this from a change hardly notice it."""
@@ -39,7 +39,14 @@ class State:
     def with_patch(self, mask: Mask, plane: Plane, *, hangs: bool = False) -> State:
         """The state with a plane within a mask; only the pings that can notice are predicted anew."""
         scene = self.scene_with(mask, plane, hangs=hangs)
-        which = pings_near(self.found, mask, scene.field, NOTICED_MM, plane)
+        return self._predicted_anew(scene, pings_near(self.found, mask, scene.field, NOTICED_MM, plane))
+
+    def without(self, mask: Mask) -> State:
+        """The state with cells that sound does not reach."""
+        scene = without_echo(self.scene, mask)
+        return self._predicted_anew(scene, pings_near(self.found, mask, scene.field, NOTICED_MM))
+
+    def _predicted_anew(self, scene: Surface, which: NDArray[np.int64]) -> State:
         predicted = self.predicted.copy()
         if which.size:
             predicted[which] = self.found.predict(scene, which)
@@ -63,10 +70,12 @@ def centres_mm(found: Sounding) -> NDArray[np.float64]:
     return np.array([a.elements_mm[0] for a in found.apertures])
 
 
-def pings_inside(found: Sounding, mask: Mask, field: MapField, depth_mm: float) -> NDArray[np.int64]:
-    """Pings whose foot is at least so deep inside a mask, sorted."""
+def pings_inside(
+    found: Sounding, mask: Mask, field: MapField, depth_mm: float, plane: Plane | None = None
+) -> NDArray[np.int64]:
+    """Pings whose foot, or else mirror point on a plane, is at least so deep inside a mask, sorted."""
     depth = depth_inside(mask) * field.cell_mm
-    foot = found.foot_mm
+    foot = found.foot_mm if plane is None else plane.mirror_points(centres_mm(found))
     cell = cell_index(field, foot[:, 0], foot[:, 1])
     return np.nonzero((cell >= 0) & (depth.ravel()[cell] > depth_mm))[0]
 

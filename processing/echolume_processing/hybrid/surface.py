@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
@@ -14,6 +14,8 @@ from echolume_messages.plan import MapField
 AZIMUTHS = 24
 """Directions in which the horizon of a facet is known."""
 HORIZON_MM = 50.0
+UNREACHED = 1e6
+"""Tangent of the elevation of a horizon that hides everything."""
 WALL_MM = 2.0
 """A rise of more than this between two neighbouring cells is a wall, not a slope."""
 
@@ -77,6 +79,13 @@ def reshaped(scene: Surface, height_mm: NDArray[np.float64], hanging: NDArray[np
         _renew_horizons(horizon, height_mm, scene.field.cell_mm, window)
     walls = _walls(height_mm, scene.field, hanging)
     return Surface(scene.field, height_mm, slopes(height_mm, scene.field.cell_mm), horizon, walls, hanging)
+
+
+def without_echo(scene: Surface, mask: NDArray[np.bool_]) -> Surface:
+    """The surface with cells that sound does not reach: their horizon is all around and up to the zenith."""
+    horizon = scene.horizon.copy()
+    horizon[mask] = UNREACHED
+    return replace(scene, horizon=horizon)
 
 
 def _renew_horizons(

@@ -60,7 +60,6 @@ SHADOW_MM = 3.0
 RIM_CELLS = 2
 RIM_MM = 6.0
 """The rim of a plate is sought again so far in and out, with tiles of so many cells."""
-RIM_SMOOTHING = 0.05
 VANISHED = 0.8
 """Missing echoes must bring the residual energy below this share of what it was."""
 STRAIGHT = 1.02
@@ -219,9 +218,7 @@ def _rim(state: State, believed: State, mask: Mask, plane: Plane, judges: NDArra
     at = tiles.grid >= 0
     already = np.zeros(tiles.corners.shape[0])
     already[tiles.grid[at]] = start[at]
-    share = occupancy(
-        state.found, state.scene, believed.predicted[judges], judges, plane, tiles, already, RIM_SMOOTHING
-    ).share
+    share = occupancy(state.found, state.scene, believed.predicted[judges], judges, plane, tiles, already).share
     coarse = start.copy()
     coarse[at] = share[tiles.grid[at]]
     fine = _largest(without_pinholes(tiles.fine(coarse, mask.shape) > 0.5, field.cell_mm))

@@ -18,6 +18,8 @@ TILE_CELLS = 5
 NEAR_MM = 50.0
 """Pings of which neither the foot nor the mirror point on the plate is nearer to a tile's middle do not judge it."""
 SMOOTHING = 0.03
+RIM_SMOOTHING = 0.05
+"""Where what is covered already is only refined, on smaller tiles."""
 SWEEPS = 200
 PINHOLE_MM2 = 60.0
 """Smaller gaps inside a plate are below what the echoes resolve, and closed."""
@@ -87,7 +89,6 @@ def occupancy(
     plane: Plane | None,
     tiles: Tiles,
     already: NDArray[np.float64] | None = None,
-    smoothing: float = SMOOTHING,
 ) -> Occupancy:
     """How much of each tile the plate covers.
 
@@ -144,7 +145,12 @@ def occupancy(
         gram[np.ix_(near, near)] += real @ real.T
         right[near] += real @ np.concatenate((target.real, target.imag))
         before += float((np.abs(target).astype(np.float64) ** 2).sum())
-    pull = smoothing * float(np.trace(gram)) / count * _roughness(tiles.grid, count)
+    pull = (
+        (SMOOTHING if already is None else RIM_SMOOTHING)
+        * float(np.trace(gram))
+        / count
+        * _roughness(tiles.grid, count)
+    )
     start = np.zeros(count) if already is None else already
     change = _solve_box(gram + pull, right - pull @ start, -start, 1.0 - start, SWEEPS)
     after = before + float(change @ gram @ change - 2 * right @ change)

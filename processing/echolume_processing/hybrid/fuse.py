@@ -35,8 +35,8 @@ ANOMALOUS = 0.25
 """Residual energy over measured energy above which a ping contradicts the surface."""
 ANOMALOUS_TIMES = 6.0
 """And it must be so many times that of the better pings, or the model as a whole is at fault."""
-BETTER = 0.25
-"""The better pings are this share of all: a scene may be mostly glass."""
+BETTER = 0.5
+"""The better pings are this share of all."""
 NEVER_AGREES = 0.7
 """A ping of which so much is unexplained contradicts the surface, however bad the others are."""
 PLATES = 12

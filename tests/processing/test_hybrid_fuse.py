@@ -5,8 +5,10 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
+from scipy import ndimage
 
-from echolume_drivers.emulated.scene import Material
+from echolume_drivers.emulated import scene_file
+from echolume_drivers.emulated.scene import Material, SceneBuilder
 from echolume_messages.calibration import Calibration
 from echolume_messages.types import OPTICAL_POINT, Label, Provenance
 from echolume_processing.hybrid import kernels, surface, tiles
@@ -81,7 +83,8 @@ def test_a_matte_scene_has_nothing_transparent_and_registration_finds_an_imposed
     assert not np.isin(found.cells["label"], (Label.TRANSPARENT, Label.ABSORBING, Label.UNKNOWN)).any()
     assert abs(abs(found.registration.dz_mm) - 0.4) < 0.25
     assert found.registration.residual_db < -16
-    assert found.notes == ()
+    assert len(found.notes) == 1
+    assert "its own echoes moved it: dz_mm" in found.notes[0]
 
 
 def test_without_pings_there_is_a_map_of_light_that_says_so(scan: SmallScan) -> None:
@@ -95,6 +98,57 @@ def test_without_light_everything_stays_unknown(scan: SmallScan) -> None:
     found = fuse(np.zeros(0, dtype=OPTICAL_POINT), scan.pings[:3], scan.calibration, FIELD)
     assert (found.cells["label"] == Label.UNKNOWN).all()
     assert np.isnan(found.cells["front_mm"]).all()
+
+
+def test_a_hanging_plate_is_found_and_its_hole_stays_open() -> None:
+    scan = small_scan(
+        scene_file.build(
+            scene_file.parse(
+                """
+                name = "holed"
+                [[piece]]
+                kind = "plate"
+                material = "glass"
+                x_mm = [-40.0, 34.0]
+                y_mm = [-36.0, 36.0]
+                z_mm = 26.0
+                thickness_mm = 3.0
+                holes = [{ x_mm = 0.0, y_mm = 0.0, diameter_mm = 30.0 }]
+                """
+            )
+        ),
+        seed=3,
+        pitch_mm=10.0,
+    )
+    found = fuse(scan.optical, scan.pings, scan.calibration, FIELD)
+    glass = cut(scan.scene.material) == Material.GLASS
+    named = found.image("label") == Label.TRANSPARENT
+    assert (glass & named).sum() / glass.sum() > 0.9
+    assert (glass & named).sum() / named.sum() > 0.9
+    assert np.abs(found.image("front_mm")[named] - 26.0).max() < 0.3
+    y, x = np.mgrid[-47.5:48.0, -47.5:48.0]
+    assert not named[np.hypot(x, y) < 11].any()
+
+
+def test_where_light_sees_next_to_nothing_sound_speaks_alone_and_is_not_registered() -> None:
+    scan = small_scan(SceneBuilder("dark").box((-70, 70), (-70, 70), 18.0, Material.GLASS).build())
+    beyond = np.abs(scan.optical["x_mm"]) > 66
+    ghosts = scan.optical[beyond | (np.abs(scan.optical["y_mm"]) > 66)]
+    found = fuse(ghosts, scan.pings, scan.calibration, FIELD)
+    claimed = np.isfinite(found.image("front_mm"))
+    assert claimed.mean() > 0.9
+    assert np.abs(found.image("front_mm")[claimed] - 18.0).max() < 0.5
+    assert (found.image("label")[claimed] == Label.ABSORBING).all()
+    assert found.registration.pings == 0
+    assert any("not registered" in note for note in found.notes)
+
+
+def test_beside_a_rim_cells_are_less_sure(scan: SmallScan, found: HybridMap) -> None:
+    named = found.image("label") == Label.TRANSPARENT
+    inner = ndimage.binary_erosion(named, iterations=8)
+    rim = named & ~ndimage.binary_erosion(named)
+    assert np.median(found.image("sigma_mm")[inner]) < 0.2
+    assert np.median(found.image("sigma_mm")[rim]) > 3.0
 
 
 def test_a_narrow_band_says_what_it_cannot_decide(scan: SmallScan) -> None:

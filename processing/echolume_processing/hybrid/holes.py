@@ -16,6 +16,10 @@ LEAST_NEIGHBOURS = 3
 ABSORBING_MM = 9.0
 """A hole that a square of this side fits into is more than a shadow beside a step."""
 BENCH_MM = 0.0
+LOOKED_CELLS = 3.0
+"""The lower ground is sought so much further than twice the distance to the nearest seen cell."""
+LOOKED_WIDE_CELLS = 25.0
+"""Beside a wide hole, further: light sees the rim of a plate, and nothing of what is next to it."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +61,7 @@ def close(grid: OpticalGrid) -> Closed:
     absorbing = tuple(np.asarray(labels == k) for k in range(1, number + 1))
     occluded = holes & ~wide
     height_mm = np.where(seen, grid.height_mm, BENCH_MM)
-    _fill_from_lower(height_mm, seen, holes)
+    _fill_from_lower(height_mm, seen, holes, wide)
     return Closed(height_mm, seen, occluded, absorbing, ~swept)
 
 
@@ -71,7 +75,7 @@ def _swept(seen: Mask) -> Mask:
     return out
 
 
-def _fill_from_lower(height_mm: NDArray[np.float64], seen: Mask, holes: Mask) -> None:
+def _fill_from_lower(height_mm: NDArray[np.float64], seen: Mask, holes: Mask, wide: Mask) -> None:
     """Give each hole cell the height of the nearest seen rim cell among the low ones around it."""
     labels, number = labelled(holes)
     for k in range(1, number + 1):
@@ -82,12 +86,12 @@ def _fill_from_lower(height_mm: NDArray[np.float64], seen: Mask, holes: Mask) ->
         if not rim.any():
             continue
         cells, rim_cells = np.argwhere(inside), np.argwhere(rim)
-        view = height_mm[around]
+        view, looked = height_mm[around], LOOKED_WIDE_CELLS if wide[around][inside].any() else LOOKED_CELLS
         rim_mm = view[rim]
         known = NearestPoints(rim_cells.astype(np.float64))
         nearest, _ = known.nearest(cells.astype(np.float64))
         for cell, distance in zip(cells, nearest, strict=True):
-            near = known.around(cell.astype(np.float64), 2 * float(distance) + 3.0)
+            near = known.around(cell.astype(np.float64), 2 * float(distance) + looked)
             low = near[rim_mm[near] <= rim_mm[near].min() + 1.0]
             away = ((rim_cells[low] - cell) ** 2).sum(axis=1)
             view[cell[0], cell[1]] = rim_mm[low[int(np.argmin(away))]]

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from echolume_messages.plan import MapField
-from echolume_processing.hybrid.grid import cell_index
-from echolume_processing.hybrid.model import cell_centres_mm
-from echolume_processing.hybrid.plates import PingHeights, Plane, fit_plane, ping_heights
-from echolume_processing.hybrid.scipy_typed import NearestPoints, depth_inside, labelled
-from echolume_processing.hybrid.sounding import Sounding, Spectra
-from echolume_processing.hybrid.surface import Surface, reshaped
-from echolume_processing.hybrid.tiles import Mask, covered, occupancy, tiles_over
+from echolume_messages.types import Label
+from echolume_processing.hybrid.heard import Heard, Seed, seeds
+from echolume_processing.hybrid.outline import straightened
+from echolume_processing.hybrid.plates import Plane, fit_plane, ping_heights
+from echolume_processing.hybrid.scipy_typed import Mask, NearestPoints, depth_inside, distance_to, labelled, opened
+from echolume_processing.hybrid.sounding import Sounding
+from echolume_processing.hybrid.state import State, cells_near, centres_mm, pings_inside, pings_near, residual_of
+from echolume_processing.hybrid.tiles import covered, occupancy, tiles_over, without_pinholes
 
 INSIDE_MM = 5.0
 """A ping counts as over a hole if its foot is this far inside; less in a small one."""
@@ -27,21 +27,43 @@ EXPLAINED = 0.2
 LEAST_PINGS = 3
 LEAST_OVER_HOLE = 2
 JUDGED_MM = 30.0
-"""Pings whose foot is this near to a region judge it."""
-NOTICED_MM = 50.0
-"""Pings further than this from a change hardly notice it."""
+"""Pings whose foot or mirror point is this near to a region judge it."""
 JUDGES = 80
-"""So many judges are enough to accept or refuse a plate."""
+"""So many judges are enough to accept or refuse a surface."""
 STEP_MM = 0.3
 """Step of the parabola through three heights."""
 ACCEPTED = 0.6
-"""A plate must bring the residual energy below this share of what it was."""
-TILT_GAIN = 0.95
-LEAST_SLOPE = 0.01
+"""A surface must bring the residual energy below this share of what it was."""
+INSIDE_LEFT = 0.45
+"""Over a plate's own cells no more than this of the measured energy may be left over."""
+CLOSE_MM = 2.0
+"""Pings whose own height is this near to a plane may have met it."""
+LEVEL_FIRST = 0.95
+"""A tilted plane must explain so much better than a level one."""
 LEAST_MM2 = 150.0
 LEAST_RISE_MM = 1.5
-NEIGHBOUR_MM = 12.0
-"""Cells this near to an anomalous ping may belong to a plate."""
+NEIGHBOUR_MM = 14.0
+"""Cells this near to where a ping met a plate may belong to it."""
+BENT_MM = (0.3, 4.0)
+"""Through a plate a camera sees the ground too high by so much."""
+GROWS = 3
+END_MM, LEAST_AT_END_MM2 = 3.0, 40.0
+"""A plate of which so much lies so near to the end of what was searched may reach further."""
+SNAP_MM = 4.0
+"""Between the rim of a dark surface as sound sees it and as light does may lie so much."""
+DARK_SHARE = 0.5
+"""A surface that light is missing over so much of is not one that light goes through."""
+KEPT = 0.3
+"""Cells of a hole of which sound finds less than this covered do not belong to the surface in it."""
+SHADOW_MM = 3.0
+"""Narrower strips of such cells are within what sound resolves."""
+RIM_CELLS = 2
+RIM_MM = 6.0
+"""The rim of a plate is sought again so far in and out, with tiles of so many cells."""
+VANISHED = 0.8
+"""Missing echoes must bring the residual energy below this share of what it was."""
+STRAIGHT = 1.02
+"""An outline with straight sides may leave so much more over."""
 NARROW = 0.3
 """Below this relative bandwidth a height is only known up to half a wavelength, unless the echoes say more."""
 RIVAL = 1.15
@@ -58,96 +80,194 @@ class Patch:
     pings: int
     ambiguous: bool
     """Another height, half a wavelength off, explains the echoes as well."""
+    label: Label
+    """Absorbing: light returned nothing from most of it; transparent: light goes through; matte: light sees it, bent by
+    a plate beside it."""
 
 
-@dataclass(frozen=True)
-class State:
-    """The surface as it is believed so far, and the echoes that it predicts for all pings."""
-
-    found: Sounding
-    scene: Surface
-    predicted: Spectra
-
-    def residual(self) -> NDArray[np.float64]:
-        """Residual energy of each ping over its measured energy."""
-        return self.found.residual(self.predicted, np.arange(len(self.found.apertures)))
-
-    def with_height(self, height_mm: NDArray[np.float64], changed: Mask) -> State:
-        """The state after some cells got another height; only the pings that can notice are predicted anew."""
-        scene = reshaped(self.scene, height_mm)
-        which = pings_near(self.found, changed, self.scene.field, NOTICED_MM)
-        predicted = self.predicted.copy()
-        if which.size:
-            predicted[which] = self.found.predict(scene, which)
-        return State(self.found, scene, predicted)
-
-
-def pings_near(found: Sounding, mask: Mask, field: MapField, distance_mm: float) -> NDArray[np.int64]:
-    """Pings whose foot is within a distance of a mask, sorted."""
-    x_mm, y_mm = np.meshgrid(*cell_centres_mm(field))
-    away, _ = NearestPoints(np.column_stack((x_mm[mask], y_mm[mask]))).nearest(found.foot_mm)
-    return np.nonzero(away <= distance_mm)[0]
-
-
-def pings_inside(found: Sounding, mask: Mask, field: MapField, depth_mm: float) -> NDArray[np.int64]:
-    """Pings whose foot is at least so deep inside a mask, sorted."""
-    depth = depth_inside(mask) * field.cell_mm
-    foot = found.foot_mm
-    cell = cell_index(field, foot[:, 0], foot[:, 1])
-    return np.nonzero((cell >= 0) & (depth.ravel()[cell] > depth_mm))[0]
-
-
-def absorbing(state: State, hole: Mask) -> Patch | None:
-    """Height of the surface that fills an optical hole; None if sound does not see it either."""
+def absorbing(state: State, hole: Mask, heard: Heard) -> Patch | None:
+    """The plane that fills an optical hole, or most of it; None if sound finds none."""
     found, field = state.found, state.scene.field
     deepest_mm = float(depth_inside(hole).max()) * field.cell_mm
     over = pings_inside(found, hole, field, min(INSIDE_MM, 0.3 * deepest_mm))
     if over.size < LEAST_OVER_HOLE:
         return None
-    heights = ping_heights(found, over)
+    judges = over[:: max(1, over.size // JUDGES)]
+    before = residual_of(found, state.predicted[judges], judges)
+    heights = ping_heights(found, judges)
     middle = found.foot_mm[over].mean(axis=0)
     level = [Plane(float(middle[0]), float(middle[1]), z) for z in heights.candidates(CANDIDATES, APART_MM)]
-    patch = _settle(state, hole, [*level, fit_plane(found, heights, True)], heights)
-    after = _residual(found, found.predict(_with_patch(state.scene, hole, patch.plane), over), over)
-    return patch if after < max(EXPLAINED, ACCEPTED * _residual(found, state.predicted[over], over)) else None
+    seen = seeds(heard, over)[:1]
+    planes = [*level, fit_plane(found, heights, True), *(seed.plane for seed in seen)]
+    plane, ambiguous = _settle(state, hole, planes, judges)
+    any_over = pings_inside(found, hole, field, 0.0)
+    near = cells_near(plane.mirror_points(centres_mm(found)[any_over]), field, NEIGHBOUR_MM)
+    mask = _within(state, hole & near, plane)
+    if mask.sum() * field.cell_mm**2 < LEAST_MM2 / 2:
+        return None
+    after = residual_of(found, found.predict(state.scene_with(mask, plane), judges), judges)
+    if after >= max(EXPLAINED, ACCEPTED * before):
+        return None
+    centre = centres_mm(found)[judges]
+    off_mm = heights.height_mm - plane.at(centre[:, 0], centre[:, 1])
+    spread_mm = seen[0].spread_mm if seen else 1.4826 * float(np.median(np.abs(off_mm)))
+    sigma_mm = max(0.05, spread_mm / float(np.sqrt(over.size)))
+    return Patch(mask, plane, sigma_mm, int(over.size), ambiguous, Label.ABSORBING)
 
 
-def transparent(state: State, cluster: NDArray[np.int64]) -> Patch | None:
-    """The plate that explains a cluster of anomalous pings; None if none does.
+def _within(state: State, hole: Mask, plane: Plane) -> Mask:
+    """The cells of a hole that a plane fills, by sound: shadows beside what is dark do not belong to it."""
+    field = state.scene.field
+    if not hole.any():
+        return hole
+    judges = pings_near(state.found, hole, field, JUDGED_MM, plane)
+    tiles = tiles_over(distance_to(hole) * field.cell_mm <= SNAP_MM)
+    share = occupancy(state.found, state.scene, state.predicted[judges], judges, plane, tiles).share
+    bare = hole & (tiles.fine(np.where(tiles.grid >= 0, share[tiles.grid], 0.0), hole.shape) < KEPT)
+    return hole & ~opened(bare, max(1, round(SHADOW_MM / field.cell_mm)))
+
+
+def plate(state: State, seed: Seed, dark: Mask) -> tuple[Patch, State] | None:
+    """The surface in the plane of a seed that explains its pings, and the state with it; None if it does not.
 
     Parameters
     ----------
     state
         What is believed so far; it predicts these pings badly.
-    cluster
-        Pings of one connected region.
+    seed
+        A plane, the pings that met it and where.
+    dark
+        Where light returned nothing.
     """
     found, field = state.found, state.scene.field
-    window = _around(found, cluster, field)
-    judges = pings_near(found, window, field, JUDGED_MM)
+    mask, judges = _extent(state, seed)
+    if mask.sum() * field.cell_mm**2 < LEAST_MM2:
+        return None
+    plane, ambiguous = _settle(state, mask, [seed.plane], seed.which)
+    rise_mm = float(np.median((plane.image(field) - state.scene.height_mm)[mask]))
+    if rise_mm < LEAST_RISE_MM:
+        return None
+    is_dark = bool((mask & dark).sum() >= DARK_SHARE * mask.sum())
+    if is_dark:
+        mask = dark & (distance_to(mask) * field.cell_mm <= SNAP_MM)
+    ways = [(hangs, state.with_patch(mask, plane, hangs=hangs)) for hangs in (False, True)]
+    before = residual_of(found, state.predicted[judges], judges)
+    after = [residual_of(found, believed.predicted[judges], judges) for _, believed in ways]
+    hangs, believed = ways[int(np.argmin(after))]
+    if min(after) >= ACCEPTED * before:
+        return None
+    if not is_dark:
+        mask = _rim(state, believed, mask, plane, judges)
+        believed = state.with_patch(mask, plane, hangs=hangs)
+        mask, believed = _straight(state, believed, mask, plane, judges)
+    inside = pings_inside(found, mask, field, 0.0, plane)
+    if inside.size and residual_of(found, believed.predicted[inside], inside) > INSIDE_LEFT:
+        return None
+    label = Label.ABSORBING if is_dark else Label.TRANSPARENT
+    return Patch(mask, plane, seed.sigma_mm, int(seed.which.size), ambiguous, label), believed
+
+
+def bent(state: State, seed: Seed, beside: Mask) -> tuple[Patch, State] | None:
+    """The ground where light sees it too high, bent by a plate beside it, and the state with it; None if it is not so.
+
+    Parameters
+    ----------
+    beside
+        Cells near to the rim of a plate, of which sound has not said anything.
+    """
+    found, field = state.found, state.scene.field
+    too_high_mm = state.scene.height_mm - seed.plane.image(field)
+    near = cells_near(seed.place_mm, field, NEIGHBOUR_MM)
+    mask = near & beside & (too_high_mm > BENT_MM[0]) & (too_high_mm < BENT_MM[1])
+    if mask.sum() * field.cell_mm**2 < LEAST_MM2:
+        return None
+    believed = state.with_patch(mask, seed.plane)
+    before, after = (residual_of(found, s.predicted[seed.which], seed.which) for s in (state, believed))
+    if after >= ACCEPTED * before:
+        return None
+    return Patch(mask, seed.plane, seed.sigma_mm, int(seed.which.size), False, Label.MATTE), believed
+
+
+def _extent(state: State, seed: Seed) -> tuple[Mask, NDArray[np.int64]]:
+    """Cells that a plate in the plane of a seed covers, and the pings that judge it.
+
+    Sought around where pings met it, and further on as long as it reaches the end of what was searched.
+    """
+    found, field = state.found, state.scene.field
+    window = cells_near(seed.place_mm, field, NEIGHBOUR_MM)
+    mask, judges = np.zeros_like(window), seed.which
+    for _ in range(GROWS):
+        judges = pings_near(found, window, field, JUDGED_MM, seed.plane)
+        tiles = tiles_over(window)
+        share = occupancy(found, state.scene, state.predicted[judges], judges, seed.plane, tiles).share
+        mask = _largest(covered(share, tiles, window.shape, field.cell_mm))
+        at_end = mask & (distance_to(~window) * field.cell_mm <= END_MM)
+        if at_end.sum() * field.cell_mm**2 < LEAST_AT_END_MM2:
+            break
+        window |= distance_to(at_end) * field.cell_mm <= NEIGHBOUR_MM
+    return mask, judges
+
+
+def _rim(state: State, believed: State, mask: Mask, plane: Plane, judges: NDArray[np.int64]) -> Mask:
+    """The mask with its rim found again on small tiles, from what the plate so far leaves over."""
+    field = state.scene.field
+    depth_mm = np.where(mask, depth_inside(mask), distance_to(mask)) * field.cell_mm
+    band = depth_mm <= RIM_MM
+    tiles = tiles_over(band, RIM_CELLS)
+    start = tiles.mean(mask)
+    at = tiles.grid >= 0
+    already = np.zeros(tiles.corners.shape[0])
+    already[tiles.grid[at]] = start[at]
+    share = occupancy(state.found, state.scene, believed.predicted[judges], judges, plane, tiles, already).share
+    coarse = start.copy()
+    coarse[at] = share[tiles.grid[at]]
+    fine = _largest(without_pinholes(tiles.fine(coarse, mask.shape) > 0.5, field.cell_mm))
+    return fine if fine.any() else mask
+
+
+def _straight(state: State, believed: State, mask: Mask, plane: Plane, judges: NDArray[np.int64]) -> tuple[Mask, State]:
+    """The mask with straight sides that meet in corners, and the state with it, if the echoes do not object."""
+    straight = straightened(mask, state.scene.field.cell_mm)
+    if not straight.any() or np.array_equal(straight, mask):
+        return mask, believed
+    hangs = believed.scene.hanging is not state.scene.hanging
+    other = state.with_patch(straight, plane, hangs=hangs)
+    before, after = (residual_of(state.found, s.predicted[judges], judges) for s in (believed, other))
+    return (straight, other) if after <= STRAIGHT * before else (mask, believed)
+
+
+def seeds_by_height(found: Sounding, cluster: NDArray[np.int64]) -> list[Seed]:
+    """A level and a tilted plane through the heights of some pings, for echoes from which no contact can be told."""
     heights = ping_heights(found, cluster)
-    jury = judges[:: max(1, judges.size // JUDGES)]
-    before = _residual(found, state.predicted[jury], jury)
-    best: Patch | None = None
-    best_after = ACCEPTED * before
+    centre, out = centres_mm(found)[cluster], list[Seed]()
     for tilted in (False, True):
         plane = fit_plane(found, heights, tilted)
-        if tilted and np.hypot(plane.slope_x, plane.slope_y) < LEAST_SLOPE:
+        if tilted and plane.slope_x == plane.slope_y == 0.0:
             continue
-        mask = _extent(state, window, judges, plane)
-        if mask.sum() * field.cell_mm**2 < LEAST_MM2:
-            continue
-        inside = np.isin(heights.which, pings_inside(found, mask, field, 0.0))
-        if inside.sum() < LEAST_PINGS:
-            continue
-        patch = _settle(state, mask, [plane], heights.some(inside))
-        rise_mm = float(np.median((patch.plane.image(field) - state.scene.height_mm)[mask]))
-        if rise_mm < LEAST_RISE_MM:
-            continue
-        after = _residual(found, found.predict(_with_patch(state.scene, mask, patch.plane), jury), jury)
-        if after < best_after:
-            best, best_after = patch, TILT_GAIN * after
-    return best
+        off_mm = np.abs(heights.height_mm - plane.at(centre[:, 0], centre[:, 1]))
+        close = off_mm <= CLOSE_MM
+        if close.sum() >= LEAST_PINGS:
+            spread_mm = 1.4826 * float(np.median(off_mm[close]))
+            out.append(Seed(plane, cluster[close], found.foot_mm[cluster], spread_mm))
+    return out
+
+
+def vanished(state: State, cluster: NDArray[np.int64]) -> Mask | None:
+    """Where the echo of the surface is missing and nothing came back instead; None if that explains nothing.
+
+    Notes
+    -----
+    A smooth plate that throws sound elsewhere hides what lies below it without an echo of its own.
+    """
+    found, field = state.found, state.scene.field
+    window = cells_near(found.foot_mm[cluster], field, NEIGHBOUR_MM)
+    judges = pings_near(found, window, field, JUDGED_MM)
+    tiles = tiles_over(window)
+    missing = occupancy(found, state.scene, state.predicted[judges], judges, None, tiles)
+    if missing.explained >= VANISHED:
+        return None
+    mask = covered(missing.share, tiles, window.shape, field.cell_mm)
+    return mask if mask.any() else None
 
 
 def clusters(found: Sounding, anomalous: NDArray[np.int64]) -> list[NDArray[np.int64]]:
@@ -169,18 +289,8 @@ def clusters(found: Sounding, anomalous: NDArray[np.int64]) -> list[NDArray[np.i
     return sorted((g for g in found_groups if g.size >= LEAST_PINGS), key=lambda g: (-g.size, int(g[0])))
 
 
-def _around(found: Sounding, cluster: NDArray[np.int64], field: MapField) -> Mask:
-    """Cells near to the feet of a cluster."""
-    x_mm, y_mm = np.meshgrid(*cell_centres_mm(field))
-    away, _ = NearestPoints(found.foot_mm[cluster]).nearest(np.column_stack((x_mm.ravel(), y_mm.ravel())))
-    return (away <= NEIGHBOUR_MM).reshape(field.shape)
-
-
-def _extent(state: State, window: Mask, judges: NDArray[np.int64], plane: Plane) -> Mask:
-    """Cells that a plate in a given plane covers: the largest connected piece."""
-    tiles = tiles_over(window)
-    share = occupancy(state.found, state.scene, state.predicted[judges], judges, plane, tiles)
-    mask = covered(share, tiles, window.shape)
+def _largest(mask: Mask) -> Mask:
+    """The largest connected piece."""
     labels, number = labelled(mask)
     if number <= 1:
         return mask
@@ -189,35 +299,29 @@ def _extent(state: State, window: Mask, judges: NDArray[np.int64], plane: Plane)
     return labels == int(sizes.argmax())
 
 
-def _with_patch(scene: Surface, mask: Mask, plane: Plane) -> Surface:
-    return reshaped(scene, np.where(mask, plane.image(scene.field), scene.height_mm))
+def is_narrow(found: Sounding) -> bool:
+    """Whether the band is too narrow for one height to be told from the next."""
+    return found.band.high_hz - found.band.low_hz < NARROW * found.band.low_hz
 
 
-def _residual(found: Sounding, predicted: Spectra, which: NDArray[np.int64]) -> float:
-    """Residual energy of some pings over their measured energy, as one number."""
-    energy = found.energy[which]
-    return float((found.residual(predicted, which) * energy).sum() / energy.sum())
-
-
-def _settle(state: State, mask: Mask, planes: list[Plane], over: PingHeights) -> Patch:
-    """Choose a plane and refine its height on the pings right over it."""
-    judges = over.which[:: max(1, over.which.size // 16)]
-    near = _with_patch(state.scene, mask, planes[0])
+def _settle(state: State, mask: Mask, planes: list[Plane], over: NDArray[np.int64]) -> tuple[Plane, bool]:
+    """Choose a plane and refine its height on the pings right over it; and whether another height is as good."""
+    judges = over[:: max(1, over.size // 16)]
+    near = state.scene_with(mask, planes[0])
 
     def cost(plane: Plane) -> float:
-        return _residual(state.found, state.found.predict(_with_patch(near, mask, plane), judges), judges)
+        return residual_of(state.found, state.found.predict(state.scene_with(mask, plane, near), judges), judges)
 
-    costs = [cost(p) * (1.0 if p.slope_x == p.slope_y == 0.0 else 1 / TILT_GAIN) for p in planes]
+    costs = [cost(p) * (1.0 if p.slope_x == p.slope_y == 0.0 else 1 / LEVEL_FIRST) for p in planes]
     best = int(np.argmin(costs))
     plane, level = planes[best], costs[best]
     half_wave_mm = 1e3 * state.found.speed_mps / (state.found.band.low_hz + state.found.band.high_hz)
-    narrow = (state.found.band.high_hz - state.found.band.low_hz) < NARROW * state.found.band.low_hz
+    narrow = is_narrow(state.found)
     if narrow:
         plane, level = _slip(plane, level, half_wave_mm, cost)
-    plane, level = _parabola(plane, level, cost)
+    plane, level = _parabola(plane, cost)
     rivals = [cost(plane.raised(s * half_wave_mm)) for s in (-1, 1)] if narrow else []
-    spread_mm = _spread(state.found, plane, over)
-    return Patch(mask, plane, spread_mm, int(over.which.size), any(r < RIVAL * level for r in rivals))
+    return plane, any(r < RIVAL * level for r in rivals)
 
 
 def _slip(plane: Plane, level: float, half_wave_mm: float, cost: Callable[[Plane], float]) -> tuple[Plane, float]:
@@ -228,18 +332,11 @@ def _slip(plane: Plane, level: float, half_wave_mm: float, cost: Callable[[Plane
     return (rivals[k], costs[k]) if costs[k] < level else (plane, level)
 
 
-def _parabola(plane: Plane, level: float, cost: Callable[[Plane], float]) -> tuple[Plane, float]:
+def _parabola(plane: Plane, cost: Callable[[Plane], float]) -> tuple[Plane, float]:
     """Refine a height by the parabola through three residuals, at most `STEP_MM` away."""
-    below, above = cost(plane.raised(-STEP_MM)), cost(plane.raised(STEP_MM))
+    below, level, above = (cost(plane.raised(step)) for step in (-STEP_MM, 0.0, STEP_MM))
     bend = below - 2 * level + above
     if bend <= 0:
         return plane, level
     shift_mm = float(np.clip(0.5 * (below - above) / bend, -1.0, 1.0)) * STEP_MM
     return plane.raised(shift_mm), level - 0.125 * (below - above) ** 2 / bend
-
-
-def _spread(found: Sounding, plane: Plane, over: PingHeights) -> float:
-    """Standard deviation of a plane's height: robust spread of its pings' own heights over the root of their number."""
-    centre = np.array([found.apertures[int(k)].elements_mm[0] for k in over.which])
-    spread_mm = 1.4826 * float(np.median(np.abs(over.height_mm - plane.at(centre[:, 0], centre[:, 1]))))
-    return max(0.05, spread_mm / float(np.sqrt(over.which.size)))

@@ -37,6 +37,12 @@ class Plane:
         """Height at each cell of a field."""
         return self.at(*np.meshgrid(*cell_centres_mm(field)))
 
+    def mirror_points(self, centre_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """x and y of the foot of the perpendicular from each point (n, 3) on the plane, shape (n, 2)."""
+        slope = np.array([self.slope_x, self.slope_y])
+        above = (centre_mm[:, 2] - self.at(centre_mm[:, 0], centre_mm[:, 1])) / (1 + slope @ slope)
+        return centre_mm[:, :2] + above[:, None] * slope
+
     def raised(self, dz_mm: float) -> Plane:
         """The parallel plane, higher by `dz_mm`."""
         return Plane(self.x_mm, self.y_mm, self.z_mm + dz_mm, self.slope_x, self.slope_y)

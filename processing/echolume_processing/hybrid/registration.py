@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +11,8 @@ from echolume_processing.hybrid.alignment import at_assumed_speed, equations, li
 from echolume_processing.hybrid.model import MOVES, Registration
 from echolume_processing.hybrid.predict import Aperture
 from echolume_processing.hybrid.setup_error import DRIFT, NAMES, POSE, SHIFTS, SPEED, displacements, faster, moved
+from echolume_processing.hybrid.sounding import Sounding, Spectra
 from echolume_processing.hybrid.surface import Surface
-
-if TYPE_CHECKING:
-    from echolume_processing.hybrid.sounding import Sounding, Spectra
 
 SEARCH_MM = 2.1
 """The first look goes this far up and down,"""

@@ -63,6 +63,13 @@ def depth_inside(mask: Mask) -> NDArray[np.float64]:
     return found[1:-1, 1:-1]
 
 
+def distance_to(mask: Mask) -> NDArray[np.float64]:
+    """Distance of each cell to the nearest cell of a mask, in cells; infinite if the mask is empty."""
+    if not mask.any():
+        return np.full(mask.shape, np.inf)
+    return np.asarray(ndimage.distance_transform_edt(~mask), dtype=np.float64)
+
+
 def interpolated(
     image: NDArray[np.float64], rows: NDArray[np.float64], columns: NDArray[np.float64]
 ) -> NDArray[np.float64]:

@@ -14,13 +14,10 @@ from echolume_messages.calibration import ArrayCalibration
 from echolume_processing.hybrid.alignment import at_assumed_speed
 from echolume_processing.hybrid.channel import Channels, Gate, band_of, channels, gate, speed_of_sound
 from echolume_processing.hybrid.predict import Aperture, Band, Predictor, aperture
-from echolume_processing.hybrid.registration import register
 from echolume_processing.hybrid.setup_error import prior_sigma
 from echolume_processing.hybrid.surface import Surface
 from echolume_processing.ping import Ping
 from echolume_processing.ultrasonic.pose_covariance import array_pose_covariance
-
-__all__ = ["Sounding", "Spectra", "Waveforms", "register", "sounding"]
 
 CEILING_MM = 70.0
 """No scene is higher than this above the bench."""

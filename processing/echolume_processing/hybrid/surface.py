@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
@@ -14,6 +14,8 @@ from echolume_messages.plan import MapField
 AZIMUTHS = 24
 """Directions in which the horizon of a facet is known."""
 HORIZON_MM = 50.0
+UNREACHED = 1e6
+"""Tangent of the elevation of a horizon that hides everything."""
 WALL_MM = 2.0
 """A rise of more than this between two neighbouring cells is a wall, not a slope."""
 
@@ -30,6 +32,8 @@ class Surface:
     """Tangent of the elevation under which the surroundings rise, shape (rows, columns, AZIMUTHS)."""
     walls: NDArray[np.float64]
     """Upright faces (n, 6): x, y of the face's middle, its lower and upper z, and its outward normal nx, ny."""
+    hanging: NDArray[np.bool_] | None = None
+    """Cells of plates that hang in the air, without sides down to what is below them; None: there are none."""
 
 
 def surface(height_mm: NDArray[np.float64], field: MapField) -> Surface:
@@ -49,8 +53,15 @@ def surface(height_mm: NDArray[np.float64], field: MapField) -> Surface:
     return Surface(field, height_mm, slopes(height_mm, field.cell_mm), horizon, _walls(height_mm, field))
 
 
-def reshaped(scene: Surface, height_mm: NDArray[np.float64]) -> Surface:
-    """The surface with other heights; horizons are renewed only around cells that moved by more than a wall."""
+def reshaped(scene: Surface, height_mm: NDArray[np.float64], hanging: NDArray[np.bool_] | None = None) -> Surface:
+    """The surface with other heights; horizons are renewed only around cells that moved by more than a wall.
+
+    Cells that `hanging` names, and those that hung before, have no sides.
+    """
+    if hanging is None:
+        hanging = scene.hanging
+    elif scene.hanging is not None:
+        hanging = hanging | scene.hanging
     height_mm = np.ascontiguousarray(height_mm, dtype=np.float64)
     moved = np.abs(height_mm - scene.height_mm) > WALL_MM
     horizon = scene.horizon
@@ -66,9 +77,15 @@ def reshaped(scene: Surface, height_mm: NDArray[np.float64]) -> Surface:
         )
         horizon = horizon.copy()
         _renew_horizons(horizon, height_mm, scene.field.cell_mm, window)
-    return Surface(
-        scene.field, height_mm, slopes(height_mm, scene.field.cell_mm), horizon, _walls(height_mm, scene.field)
-    )
+    walls = _walls(height_mm, scene.field, hanging)
+    return Surface(scene.field, height_mm, slopes(height_mm, scene.field.cell_mm), horizon, walls, hanging)
+
+
+def without_echo(scene: Surface, mask: NDArray[np.bool_]) -> Surface:
+    """The surface with cells that sound does not reach: their horizon is all around and up to the zenith."""
+    horizon = scene.horizon.copy()
+    horizon[mask] = UNREACHED
+    return replace(scene, horizon=horizon)
 
 
 def _renew_horizons(
@@ -129,18 +146,26 @@ def _horizons(
                 out[j, i, a] = best
 
 
-def _walls(height_mm: NDArray[np.float64], field: MapField) -> NDArray[np.float64]:
-    """Faces between neighbouring cells whose heights differ by more than `WALL_MM`."""
+def _walls(
+    height_mm: NDArray[np.float64], field: MapField, hanging: NDArray[np.bool_] | None = None
+) -> NDArray[np.float64]:
+    """Faces between neighbouring cells whose heights differ by more than `WALL_MM`, unless the higher one hangs."""
     x_mm = field.x_mm[0] + np.arange(height_mm.shape[1] + 1) * field.cell_mm
     y_mm = field.y_mm[0] + np.arange(height_mm.shape[0] + 1) * field.cell_mm
     found: list[NDArray[np.float64]] = []
     half = 0.5 * field.cell_mm
     rise = np.diff(height_mm, axis=1)
-    j, i = np.nonzero(np.abs(rise) > WALL_MM)
+    stands = np.ones(rise.shape, dtype=np.bool_)
+    if hanging is not None:
+        stands = ~np.where(rise > 0, hanging[:, 1:], hanging[:, :-1])
+    j, i = np.nonzero((np.abs(rise) > WALL_MM) & stands)
     low, high = np.minimum(height_mm[j, i], height_mm[j, i + 1]), np.maximum(height_mm[j, i], height_mm[j, i + 1])
     found.append(np.column_stack((x_mm[i + 1], y_mm[j] + half, low, high, -np.sign(rise[j, i]), 0.0 * low)))
     rise = np.diff(height_mm, axis=0)
-    j, i = np.nonzero(np.abs(rise) > WALL_MM)
+    stands = np.ones(rise.shape, dtype=np.bool_)
+    if hanging is not None:
+        stands = ~np.where(rise > 0, hanging[1:], hanging[:-1])
+    j, i = np.nonzero((np.abs(rise) > WALL_MM) & stands)
     low, high = np.minimum(height_mm[j, i], height_mm[j + 1, i]), np.maximum(height_mm[j, i], height_mm[j + 1, i])
     found.append(np.column_stack((x_mm[i] + half, y_mm[j + 1], low, high, 0.0 * low, -np.sign(rise[j, i]))))
     return np.ascontiguousarray(np.concatenate(found))

@@ -10,15 +10,19 @@ from numpy.typing import NDArray
 
 from echolume_processing.hybrid.plates import Plane
 from echolume_processing.hybrid.predict import directivity
-from echolume_processing.hybrid.scipy_typed import Mask, closed, interpolated
+from echolume_processing.hybrid.scipy_typed import Mask, closed, interpolated, labelled
 from echolume_processing.hybrid.sounding import Sounding, Spectra
 from echolume_processing.hybrid.surface import Surface
 
 TILE_CELLS = 5
 NEAR_MM = 50.0
-"""Pings further than this from a tile's middle do not judge it."""
+"""Pings of which neither the foot nor the mirror point on the plate is nearer to a tile's middle do not judge it."""
 SMOOTHING = 0.03
+RIM_SMOOTHING = 0.05
+"""Where what is covered already is only refined, on smaller tiles."""
 SWEEPS = 200
+PINHOLE_MM2 = 60.0
+"""Smaller gaps inside a plate are below what the echoes resolve, and closed."""
 
 
 @dataclass(frozen=True)
@@ -29,34 +33,75 @@ class Tiles:
     grid: NDArray[np.int64]
     """Number of each tile in the window's raster of tiles, -1 where there is none."""
     origin: tuple[int, int]
+    cells: int = TILE_CELLS
+    """Side of a tile."""
+
+    def mean(self, mask: Mask) -> NDArray[np.float64]:
+        """Share of each tile of the raster (rows, columns) that a mask covers."""
+        rows, columns = self.grid.shape
+        padded = np.zeros((rows * self.cells, columns * self.cells))
+        j0, i0 = self.origin
+        part = mask[j0 : j0 + padded.shape[0], i0 : i0 + padded.shape[1]]
+        padded[: part.shape[0], : part.shape[1]] = part
+        return np.asarray(padded.reshape(rows, self.cells, columns, self.cells).mean(axis=(1, 3)))
+
+    def fine(self, coarse: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:
+        """Values of the raster's tiles (rows, columns), interpolated at every cell of a field; 0 beyond the raster."""
+        rows, columns = self.grid.shape
+        at_j = (np.arange(rows * self.cells) + 0.5) / self.cells + 0.5
+        at_i = (np.arange(columns * self.cells) + 0.5) / self.cells + 0.5
+        values = interpolated(np.pad(coarse, 1), at_j, at_i)
+        out = np.zeros(shape)
+        j0, i0 = self.origin
+        target = out[j0 : j0 + values.shape[0], i0 : i0 + values.shape[1]]
+        target[...] = values[: target.shape[0], : target.shape[1]]
+        return out
 
 
-def tiles_over(mask: Mask) -> Tiles:
+@dataclass(frozen=True)
+class Occupancy:
+    """How much of each tile is covered, and how well that explains the echoes."""
+
+    share: NDArray[np.float64]
+    """(tiles,), 0 to 1."""
+    explained: float
+    """Energy that is left over after the change, as a share of what was left over before it."""
+
+
+def tiles_over(mask: Mask, cells: int = TILE_CELLS) -> Tiles:
     """Tiles that cover a mask."""
     j, i = np.nonzero(mask)
     j0, i0 = int(j.min()), int(i.min())
-    rows, columns = (int(j.max()) - j0) // TILE_CELLS + 1, (int(i.max()) - i0) // TILE_CELLS + 1
-    padded = np.zeros((rows * TILE_CELLS, columns * TILE_CELLS), dtype=np.bool_)
-    part = mask[j0 : j0 + padded.shape[0], i0 : i0 + padded.shape[1]]
-    padded[: part.shape[0], : part.shape[1]] = part
-    used = padded.reshape(rows, TILE_CELLS, columns, TILE_CELLS).any(axis=(1, 3))
-    grid = np.full((rows, columns), -1, dtype=np.int64)
+    rows, columns = (int(j.max()) - j0) // cells + 1, (int(i.max()) - i0) // cells + 1
+    whole = Tiles(np.zeros((0, 2), dtype=np.int64), np.full((rows, columns), -1, dtype=np.int64), (j0, i0), cells)
+    used = whole.mean(mask) > 0
+    grid = whole.grid
     grid[used] = np.arange(int(used.sum()))
     tj, ti = np.nonzero(used)
-    return Tiles(np.column_stack((j0 + tj * TILE_CELLS, i0 + ti * TILE_CELLS)), grid, (j0, i0))
+    return Tiles(np.column_stack((j0 + tj * cells, i0 + ti * cells)), grid, (j0, i0), cells)
 
 
 def occupancy(
-    found: Sounding, base: Surface, predicted: Spectra, which: NDArray[np.int64], plane: Plane, tiles: Tiles
-) -> NDArray[np.float64]:
-    """How much of each tile the plate covers, 0 to 1, shape (tiles,).
+    found: Sounding,
+    base: Surface,
+    predicted: Spectra,
+    which: NDArray[np.int64],
+    plane: Plane | None,
+    tiles: Tiles,
+    already: NDArray[np.float64] | None = None,
+) -> Occupancy:
+    """How much of each tile the plate covers.
 
     Parameters
     ----------
+    base
+        The surface without the plate.
     predicted
-        Echoes of the base alone for the pings `which`.
+        Echoes for the pings `which`: of the base, with what is covered already.
     plane
-        Where the plate lies.
+        Where the plate lies; None: something that takes the base's echo away and returns none.
+    already
+        Share of each tile (tiles,) that is covered in `predicted`; None: nothing.
 
     Notes
     -----
@@ -73,45 +118,59 @@ def occupancy(
     field = base.field
     middle = np.column_stack(
         (
-            field.x_mm[0] + (tiles.corners[:, 1] + TILE_CELLS / 2) * field.cell_mm,
-            field.y_mm[0] + (tiles.corners[:, 0] + TILE_CELLS / 2) * field.cell_mm,
+            field.x_mm[0] + (tiles.corners[:, 1] + tiles.cells / 2) * field.cell_mm,
+            field.y_mm[0] + (tiles.corners[:, 0] + tiles.cells / 2) * field.cell_mm,
         )
     )
     foot_mm = found.foot_mm
     count = tiles.corners.shape[0]
-    gram, right = np.zeros((count, count)), np.zeros(count)
-    plate_mm = plane.image(field)
+    gram, right, before = np.zeros((count, count)), np.zeros(count), 0.0
+    there = plane or Plane(0.0, 0.0, 0.0)
+    plate_mm = there.image(field)
+    mirror_mm = foot_mm if plane is None else plane.mirror_points(np.array([a.elements_mm[0] for a in found.apertures]))
     for n, k in enumerate(which):
-        near = np.nonzero(np.linalg.norm(middle - foot_mm[k], axis=1) < NEAR_MM)[0]
+        away = np.minimum(np.linalg.norm(middle - foot_mm[k], axis=1), np.linalg.norm(middle - mirror_mm[k], axis=1))
+        near = np.nonzero(away < NEAR_MM)[0]
         if not near.size:
             continue
         where = found.apertures[int(k)]
         effect = _tile_spectra(
-            tiles.corners[near], base.height_mm, base.slope, plate_mm, plane.slope_x, plane.slope_y,
-            field.x_mm[0], field.y_mm[0], field.cell_mm, where.elements_mm, where.axis, table, weights, wave,
+            tiles.corners[near], tiles.cells, plane is not None, base.height_mm, base.slope, plate_mm,
+            there.slope_x, there.slope_y, field.x_mm[0], field.y_mm[0], field.cell_mm, where.elements_mm, where.axis,
+            table, weights, wave,
         )  # fmt: skip
         effect = (effect * (1j * wave * response).astype(np.complex64)).reshape(near.size, -1)
         real = np.concatenate((effect.real, effect.imag), axis=1)
         target = left_over[n].reshape(-1)
         gram[np.ix_(near, near)] += real @ real.T
         right[near] += real @ np.concatenate((target.real, target.imag))
-    pull = SMOOTHING * float(np.trace(gram)) / count
-    return _solve_box(gram + pull * _roughness(tiles.grid, count), right, SWEEPS)
+        before += float((np.abs(target).astype(np.float64) ** 2).sum())
+    pull = (
+        (SMOOTHING if already is None else RIM_SMOOTHING)
+        * float(np.trace(gram))
+        / count
+        * _roughness(tiles.grid, count)
+    )
+    start = np.zeros(count) if already is None else already
+    change = _solve_box(gram + pull, right - pull @ start, -start, 1.0 - start, SWEEPS)
+    after = before + float(change @ gram @ change - 2 * right @ change)
+    return Occupancy(start + change, after / before if before > 0 else 1.0)
 
 
-def covered(share: NDArray[np.float64], tiles: Tiles, shape: tuple[int, int]) -> Mask:
-    """Cells that the plate covers: occupancies interpolated between tile middles, cut at one half, holes closed."""
-    coarse = np.where(tiles.grid >= 0, share[tiles.grid], 0.0)
-    padded = np.pad(coarse, 1)
-    rows, columns = coarse.shape
-    at_j = (np.arange(rows * TILE_CELLS) + 0.5) / TILE_CELLS + 0.5
-    at_i = (np.arange(columns * TILE_CELLS) + 0.5) / TILE_CELLS + 0.5
-    fine = interpolated(padded, at_j, at_i) > 0.5
-    out = np.zeros(shape, dtype=np.bool_)
-    j0, i0 = tiles.origin
-    target = out[j0 : j0 + fine.shape[0], i0 : i0 + fine.shape[1]]
-    target |= closed(fine)[: target.shape[0], : target.shape[1]]
-    return out
+def covered(share: NDArray[np.float64], tiles: Tiles, shape: tuple[int, int], cell_mm: float) -> Mask:
+    """Cells that the plate covers: occupancies interpolated between tile middles, cut at one half, pinholes closed."""
+    fine = tiles.fine(np.where(tiles.grid >= 0, share[tiles.grid], 0.0), shape) > 0.5
+    return without_pinholes(fine, cell_mm)
+
+
+def without_pinholes(mask: Mask, cell_mm: float) -> Mask:
+    """A mask with its inner holes of less than `PINHOLE_MM2` filled."""
+    labels, number = labelled(closed(mask) & ~mask)
+    if not number:
+        return mask
+    small = np.bincount(labels.ravel()) * cell_mm**2 < PINHOLE_MM2
+    small[0] = False
+    return mask | small[labels]
 
 
 def _roughness(grid: NDArray[np.int64], count: int) -> NDArray[np.float64]:
@@ -134,14 +193,20 @@ def warm_up() -> None:
     table, weights = np.ones((8, 1), dtype=np.float32), np.ones((1, 2), dtype=np.float32)
     corners, wave = np.zeros((1, 2), dtype=np.int64), np.array([0.8, 0.9])
     _tile_spectra(
-        corners, flat, slope, flat, 0.0, 0.0, 0.0, 0.0, 1.0, elements_mm, axis, table, weights, wave
+        corners, TILE_CELLS, True, flat, slope, flat, 0.0, 0.0, 0.0, 0.0, 1.0, elements_mm, axis, table, weights, wave
     )  # fmt: skip
-    _solve_box(np.eye(2), np.ones(2), 1)
+    _solve_box(np.eye(2), np.ones(2), np.zeros(2), np.ones(2), 1)
 
 
 @numba.njit(cache=True)
-def _solve_box(gram: NDArray[np.float64], right: NDArray[np.float64], sweeps: int) -> NDArray[np.float64]:
-    """Minimise x'Gx/2 - b'x over 0 <= x <= 1 by projected Gauss-Seidel."""
+def _solve_box(
+    gram: NDArray[np.float64],
+    right: NDArray[np.float64],
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+    sweeps: int,
+) -> NDArray[np.float64]:
+    """Minimise x'Gx/2 - b'x over low <= x <= high by projected Gauss-Seidel, from 0."""
     n = right.size
     x = np.zeros(n)
     for _ in range(sweeps):
@@ -149,13 +214,15 @@ def _solve_box(gram: NDArray[np.float64], right: NDArray[np.float64], sweeps: in
             if gram[t, t] <= 0:
                 continue
             step = (right[t] - np.dot(gram[t], x)) / gram[t, t]
-            x[t] = min(1.0, max(0.0, x[t] + step))
+            x[t] = min(high[t], max(low[t], x[t] + step))
     return x
 
 
 @numba.njit(cache=True, fastmath=True)
 def _tile_spectra(
     corners: NDArray[np.int64],
+    cells: int,
+    returns: bool,
     height_mm: NDArray[np.float64],
     slope: NDArray[np.float32],
     plate_mm: NDArray[np.float64],
@@ -170,20 +237,20 @@ def _tile_spectra(
     weights: NDArray[np.float32],
     wave: NDArray[np.float64],
 ) -> NDArray[np.complex64]:
-    """Plate minus base for each tile, per receiver and bin, without the factor jk."""
+    """Plate (if it returns anything) minus base for each tile, per receiver and bin, without the factor jk."""
     receivers, bins = elements_mm.shape[0] - 1, wave.size
     out = np.zeros((corners.shape[0], receivers, bins), dtype=np.complex64)
     first, step = wave[0], wave[1] - wave[0]
     area = cell_mm * cell_mm / (4 * np.pi)
     lobes = np.empty((receivers, bins), dtype=np.float32)
     for t in range(corners.shape[0]):
-        for layer in range(2):
+        for layer in range(0 if returns else 1, 2):
             _lobes(
-                lobes, corners[t], plate_mm if layer == 0 else height_mm, x0_mm, y0_mm, cell_mm, elements_mm, axis,
-                table, weights,
+                lobes, corners[t], cells, plate_mm if layer == 0 else height_mm, x0_mm, y0_mm, cell_mm,
+                elements_mm, axis, table, weights,
             )  # fmt: skip
-            for jj in range(TILE_CELLS):
-                for ii in range(TILE_CELLS):
+            for jj in range(cells):
+                for ii in range(cells):
                     j, i = corners[t, 0] + jj, corners[t, 1] + ii
                     if j >= height_mm.shape[0] or i >= height_mm.shape[1]:
                         continue
@@ -211,6 +278,7 @@ def _tile_spectra(
 def _lobes(
     out: NDArray[np.float32],
     corner: NDArray[np.int64],
+    cells: int,
     height_mm: NDArray[np.float64],
     x0_mm: float,
     y0_mm: float,
@@ -221,8 +289,8 @@ def _lobes(
     weights: NDArray[np.float32],
 ) -> None:
     """Directivity both ways at the middle of a tile, per receiver and bin."""
-    j = min(corner[0] + TILE_CELLS // 2, height_mm.shape[0] - 1)
-    i = min(corner[1] + TILE_CELLS // 2, height_mm.shape[1] - 1)
+    j = min(corner[0] + cells // 2, height_mm.shape[0] - 1)
+    i = min(corner[1] + cells // 2, height_mm.shape[1] - 1)
     x, y, z = x0_mm + (i + 0.5) * cell_mm, y0_mm + (j + 0.5) * cell_mm, height_mm[j, i]
     emitted = table[0]
     for c in range(elements_mm.shape[0]):

@@ -14,9 +14,10 @@ from echolume_processing.hybrid import holes
 from echolume_processing.hybrid.grid import accumulate, cell_index
 from echolume_processing.hybrid.model import HybridMap, Registration, widened
 from echolume_processing.hybrid.predict import Band
+from echolume_processing.hybrid.registration import register
 from echolume_processing.hybrid.rules.gates import GATE, SOUND_SIGMA_MM, regions, slips, with_holes
 from echolume_processing.hybrid.rules.scan import Scan, SoundImage, sound_image
-from echolume_processing.hybrid.sounding import Sounding, Spectra, register, sounding
+from echolume_processing.hybrid.sounding import Sounding, Spectra, sounding
 from echolume_processing.hybrid.surface import surface
 from echolume_processing.ping import Ping
 from echolume_processing.ultrasonic.pipeline import UltrasonicPipeline

@@ -40,7 +40,8 @@ def scan_report(path: Path, results: Mapping[str, Any]) -> Report:
     path
         Raw archive of the scan.
     results
-        What the map came to: ``scan``, ``rule``, ``digest``, ``points``, ``cells``, ``notes``.
+        What the map came to: ``scan``, ``rule``, ``registration``, ``digest``, ``points``, ``cells``,
+        ``notes``.
 
     Raises
     ------
@@ -63,6 +64,7 @@ def scan_report(path: Path, results: Mapping[str, Any]) -> Report:
         },
         "points": results["points"],
         "cells": results["cells"],
+        "registration": results["registration"],
         "digest": {"hybrid": results["digest"]},
         "notes": results["notes"],
     }

@@ -115,15 +115,6 @@ def plane_contacts(plane: Plane, receivers_mm: Points3) -> Points3:
     return plane.image_mm + along[:, None] * (receivers_mm - plane.image_mm)
 
 
-def axis_contacts(receivers_mm: Points3, paths_mm: NDArray[np.float64]) -> Points3:
-    """Contact points if the surface were perpendicular to the array's axis, (receivers, 3): on the bisector of the
-    ways to emitter and receiver."""
-    x, y, z = receivers_mm.T
-    deep = np.sqrt(np.maximum(paths_mm**2 - x**2 - y**2, 0.0))
-    share = 0.5 * (1 + np.divide(z, deep, out=np.zeros_like(deep), where=deep > 0))
-    return np.column_stack([share * x, share * y, 0.5 * (deep + z)])
-
-
 def contact(
     receivers_mm: Points3,
     paths_mm: NDArray[np.float64],

@@ -10,18 +10,27 @@ from echolume_drivers.emulated.scene import Material
 from echolume_messages.calibration import Calibration
 from echolume_messages.errors import ConfigError
 from echolume_messages.plan import MapField
-from echolume_messages.types import OPTICAL_POINT, ULTRASONIC_POINT, Label, OpticalSource, Provenance, Structured
+from echolume_messages.types import (
+    NO_TRIGGER,
+    OPTICAL_POINT,
+    ULTRASONIC_POINT,
+    Label,
+    OpticalSource,
+    Provenance,
+    Structured,
+)
 from echolume_processing.hybrid.baselines import baselines
 from echolume_processing.hybrid.digest import digest
 from echolume_processing.hybrid.fuse import fuse
 from echolume_processing.hybrid.grid import accumulate
 from echolume_processing.hybrid.model import HybridMap
-from echolume_processing.hybrid.rules.gates import footprint_mm, regions, relief, slips
+from echolume_processing.hybrid.rules.band import footprint_mm, slips
+from echolume_processing.hybrid.rules.gates import regions, relief, without_lines
 from echolume_processing.hybrid.rules.names import DEFAULT, DESCRIPTIONS
 from echolume_processing.hybrid.rules.registry import RULES, fuse_by
-from echolume_processing.hybrid.rules.scan import DOUBTFUL_MM, sigma_of
+from echolume_processing.hybrid.rules.sound import CLEAN_MM
 from echolume_processing.ultrasonic.pipeline import UltrasonicPipeline
-from processing.hybrid_scan import FIELD, SmallScan, all_matte, glass_and_black, small_scan
+from processing.hybrid_scan import FIELD, SmallScan, all_matte, glass_and_black, small_scan, triggers
 
 RIM = 120 - 48
 LIGHT = Provenance.STEREO | Provenance.ACTIVE_LEFT | Provenance.ACTIVE_RIGHT
@@ -31,6 +40,11 @@ SQUARE = MapField(x_mm=(-40.0, 40.0), y_mm=(-40.0, 40.0), cell_mm=1.0)
 def heard(scan: SmallScan) -> Structured:
     pipeline = UltrasonicPipeline(scan.calibration)
     return np.concatenate([pipeline.process(p) for p in scan.pings])
+
+
+def sound_triggers(scan: SmallScan) -> np.ndarray:
+    pipeline = UltrasonicPipeline(scan.calibration)
+    return np.concatenate([np.full(pipeline.process(p).size, p.trigger, np.uint32) for p in scan.pings])
 
 
 def cut(image: np.ndarray) -> np.ndarray:
@@ -55,8 +69,10 @@ def matte() -> SmallScan:
 @pytest.fixture(scope="module")
 def maps(scan: SmallScan, sound: Structured) -> dict[str, HybridMap]:
     some = {DEFAULT: scan.pings[::4]}
+    numbers = triggers(scan.optical), sound_triggers(scan)
     return {
-        name: fuse_by(name, scan.optical, sound, some.get(name, scan.pings), scan.calibration, FIELD) for name in RULES
+        name: fuse_by(name, scan.optical, sound, some.get(name, scan.pings), scan.calibration, FIELD, *numbers)
+        for name in RULES
     }
 
 
@@ -116,6 +132,25 @@ def test_a_rule_claims_nothing_that_was_not_measured(name: str, maps: dict[str, 
 
 
 @pytest.mark.parametrize("name", RULES)
+def test_a_rule_names_who_speaks_for_a_claim_and_how_probable_it_is(name: str, maps: dict[str, HybridMap]) -> None:
+    found = maps[name]
+    cells, stripes, pings = found.cells, found.stripes.count, found.pings.count
+    lit, by_sound = cells["optical_n"] > 0, cells["ultrasonic_n"] > 0
+    assert not lit.any() or (stripes[lit] > 0).all()
+    assert not by_sound.any() or (pings[by_sound] > 0).all()
+    known = cells["label"] != Label.UNKNOWN
+    assert (cells["probability"][known] > 0).all()
+    assert (cells["probability"][~known] == 0).all()
+
+
+def test_without_triggers_a_rule_names_nobody(scan: SmallScan, sound: Structured) -> None:
+    found = fuse_by("constant-gate", scan.optical, sound, (), scan.calibration, FIELD)
+    assert (found.cells["optical_n"] > 0).any()
+    assert found.stripes.which.size == found.pings.which.size == 0
+    assert (found.cells["stripe_first"] == NO_TRIGGER).all()
+
+
+@pytest.mark.parametrize("name", RULES)
 def test_without_evidence_a_rule_claims_nothing(name: str, scan: SmallScan) -> None:
     nothing = fuse_by(name, np.zeros(0, OPTICAL_POINT), np.zeros(0, ULTRASONIC_POINT), (), scan.calibration, FIELD)
     assert np.isnan(nothing.cells["front_mm"]).all()
@@ -127,22 +162,24 @@ def test_without_evidence_a_rule_claims_nothing(name: str, scan: SmallScan) -> N
 def test_the_order_of_points_and_pings_does_not_matter(name: str, scan: SmallScan, sound: Structured) -> None:
     rng = np.random.default_rng(5)
     pings = scan.pings[::4]
-    one = fuse_by(name, scan.optical, sound, pings, scan.calibration, FIELD)
-    two = fuse_by(name, rng.permutation(scan.optical), rng.permutation(sound), pings[::-1], scan.calibration, FIELD)
+    numbers = triggers(scan.optical), sound_triggers(scan)
+    light, heard_ = rng.permutation(scan.optical.size), rng.permutation(sound.size)
+    one = fuse_by(name, scan.optical, sound, pings, scan.calibration, FIELD, *numbers)
+    mixed = scan.optical[light], sound[heard_], pings[::-1]
+    two = fuse_by(name, *mixed, scan.calibration, FIELD, numbers[0][light], numbers[1][heard_])
     assert digest(one) == digest(two)
 
 
 def test_the_default_rule_is_the_fusion_itself(scan: SmallScan, sound: Structured, maps: dict[str, HybridMap]) -> None:
-    assert digest(maps[DEFAULT]) == digest(fuse(scan.optical, scan.pings[::4], scan.calibration, FIELD))
+    alone = fuse(scan.optical, scan.pings[::4], scan.calibration, FIELD, triggers(scan.optical))
+    assert digest(maps[DEFAULT]) == digest(alone)
 
 
 def test_the_plain_rules_have_the_heights_of_the_baselines(
     scan: SmallScan, sound: Structured, maps: dict[str, HybridMap]
 ) -> None:
     plain = baselines(scan.optical, sound, FIELD)
-    for name, height_mm in (
-        ("optical", plain.optical_mm), ("ultrasonic", plain.ultrasonic_mm), ("union", plain.union_mm)
-    ):  # fmt: skip
+    for name, height_mm in (("optical", plain.optical_mm), ("union", plain.union_mm)):
         np.testing.assert_array_equal(maps[name].image("front_mm"), height_mm.astype(np.float32))
 
 
@@ -157,15 +194,10 @@ def test_the_mean_by_variance_has_the_known_value_and_sigma(scan: SmallScan) -> 
     light, points = light_at(flat), sound_at(flat + 1.0, variance_mm2=0.25)
     own_mm = accumulate(light, SQUARE).sigma_mm
     found = fuse_by("inverse-variance", light, points, (), scan.calibration, SQUARE)
-    share = own_mm**2 / (own_mm**2 + 0.25)
+    variance = 0.25 + CLEAN_MM**2
+    share = own_mm**2 / (own_mm**2 + variance)
     np.testing.assert_allclose(found.image("front_mm"), share, rtol=1e-5)
-    np.testing.assert_allclose(found.image("sigma_mm"), 1 / np.sqrt(1 / own_mm**2 + 4), rtol=1e-5)
-
-
-def test_a_point_that_states_no_variance_is_doubtful() -> None:
-    points = np.zeros(4, dtype=ULTRASONIC_POINT)
-    points["zz_mm2"] = [0.04, np.nan, np.inf, 0.0]
-    np.testing.assert_allclose(sigma_of(points), [0.2, DOUBTFUL_MM, DOUBTFUL_MM, DOUBTFUL_MM], rtol=1e-6)
+    np.testing.assert_allclose(found.image("sigma_mm"), 1 / np.sqrt(1 / own_mm**2 + 1 / variance), rtol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["constant-gate", "footprint-gate"])
@@ -230,6 +262,27 @@ def test_relief_is_the_range_of_heights_within_a_disk() -> None:
     np.testing.assert_array_equal(relief(image, 4.5, 0.5), np.where(x**2 + y**2 <= 81, 7.0, 0.0))
 
 
+def test_relief_does_not_see_lines_but_bars() -> None:
+    image = np.zeros((40, 40))
+    image[:, 10:12] = 20.0
+    image[:, 25:30] = 20.0
+    found = without_lines(image)
+    assert (found[3:-3, :20] == 0).all()
+    assert (found[3:-3, 25:30] == 20).all()
+
+
+def test_a_gate_finds_a_plate_whose_rim_light_sees_and_beside_which_it_sees_nothing(scan: SmallScan) -> None:
+    height_mm, plate, seen = np.zeros(SQUARE.shape), np.zeros(SQUARE.shape, dtype=bool), np.ones(SQUARE.shape, bool)
+    plate[20:60, 16:46] = True
+    height_mm[20:60, 45] = 20.0
+    seen[20:60, 46:56] = False
+    points = sound_at(np.where(plate, 20.0, 0.0))
+    found = fuse_by("footprint-gate", light_at(height_mm, seen), points, (), scan.calibration, SQUARE)
+    named = found.image("label") == Label.TRANSPARENT
+    assert named[plate].mean() > 0.9
+    assert named[~plate].mean() < 0.02
+
+
 def test_regions_are_wide_and_large() -> None:
     flagged = np.zeros((60, 60), dtype=bool)
     flagged[5:25, 5:25] = flagged[40:50, 5:15] = flagged[:, 50:53] = True
@@ -268,10 +321,11 @@ def test_without_pings_the_forward_model_gate_says_so(scan: SmallScan, sound: St
 
 def test_a_gate_says_that_a_narrow_band_slips_by_half_wavelengths(scan: SmallScan, maps: dict[str, HybridMap]) -> None:
     array = msgspec.structs.replace(scan.calibration.array, low_hz=38e3, high_hz=42e3)
-    assert "n x 4.3" in slips(array)[0]
-    assert slips(scan.calibration.array) == ()
+    assert "n x 4.3" in slips(array, pings=False)[0]
+    assert "4.3" in slips(array, pings=True)[0]
+    assert slips(scan.calibration.array, pings=False) == ()
     narrow = msgspec.structs.replace(scan.calibration, array=array)
     flat = np.zeros(SQUARE.shape)
     found = fuse_by("constant-gate", light_at(flat), sound_at(flat), (), narrow, SQUARE)
-    assert found.notes == slips(array)
+    assert found.notes == slips(array, pings=False)
     assert maps["constant-gate"].notes == ()

@@ -12,6 +12,7 @@ from echolume_messages.types import Structured
 from echolume_processing.hybrid.grid import STEPS_PER_MM, accumulate, cell_index
 from echolume_processing.hybrid.model import cell_centres_mm
 from echolume_processing.hybrid.scipy_typed import NearestPoints
+from echolume_processing.hybrid.witnesses import Triggers
 
 NEAREST_MM = 20.0
 """A cell further than this from any ultrasonic point is not claimed by sound."""
@@ -48,29 +49,37 @@ def baselines(optical: Structured, ultrasonic: Structured, field: MapField) -> B
 def nearest(points: Structured, field: MapField) -> NDArray[np.float64]:
     """Height of the nearest ultrasonic contact point at each cell within `NEAREST_MM`, else nan."""
     out = np.full(field.shape, np.nan)
-    ordered, index = nearest_points(points, field)
+    ordered = placed(points)
+    index, _ = nearest_of(ordered, field)
     found = index < ordered.size
     out[found] = ordered["z_mm"][index[found]]
     return out
 
 
-def nearest_points(points: Structured, field: MapField) -> tuple[Structured, NDArray[np.int64]]:
-    """Which ultrasonic contact point is the nearest to each cell.
+def placing(points: Structured, triggers: Triggers | None = None) -> NDArray[np.int64]:
+    """Which contact points (n,) have a place, in an order of their own that no order of arrival changes."""
+    with_place = np.isfinite(points["z_mm"]) & np.isfinite(points["x_mm"]) & np.isfinite(points["y_mm"])
+    told = () if triggers is None else (triggers,)
+    order = np.lexsort([*told, *(points[name] for name in ("zz_mm2", "z_mm", "y_mm", "x_mm"))])
+    return order[with_place[order]]
 
-    Returns
-    -------
-    ordered, index
-        The points that have a place (m,), in an order of their own that no order of arrival changes; and for each cell
-        (rows, columns) the nearest of them, m where none is within `NEAREST_MM`.
+
+def placed(points: Structured) -> Structured:
+    """The contact points that have a place, in an order of their own that no order of arrival changes."""
+    return points[placing(points)]
+
+
+def nearest_of(points: Structured, field: MapField) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Which of some `placed` points is the nearest to each cell (rows, columns), and how far away it is, mm.
+
+    The index is that behind the last point, and the distance infinite, where none is within `NEAREST_MM`.
     """
-    points = points[np.isfinite(points["z_mm"]) & np.isfinite(points["x_mm"]) & np.isfinite(points["y_mm"])]
-    points = points[np.lexsort([points[name] for name in ("zz_mm2", "z_mm", "y_mm", "x_mm")])]
     if not points.size:
-        return points, np.zeros(field.shape, dtype=np.int64)
+        return np.zeros(field.shape, dtype=np.int64), np.full(field.shape, np.inf)
     x_mm, y_mm = np.meshgrid(*cell_centres_mm(field))
     known = NearestPoints(np.column_stack((points["x_mm"], points["y_mm"])).astype(np.float64))
-    _, index = known.nearest(np.column_stack((x_mm.ravel(), y_mm.ravel())), NEAREST_MM)
-    return points, index.reshape(field.shape)
+    away_mm, index = known.nearest(np.column_stack((x_mm.ravel(), y_mm.ravel())), NEAREST_MM)
+    return index.reshape(field.shape), away_mm.reshape(field.shape)
 
 
 def union(optical: Structured, ultrasonic: Structured, field: MapField) -> NDArray[np.float64]:

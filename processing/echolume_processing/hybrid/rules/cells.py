@@ -6,20 +6,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echolume_messages.plan import MapField
-from echolume_messages.types import Label, Provenance
+from echolume_messages.types import NO_TRIGGER, Label, Provenance
+from echolume_processing.hybrid import certainty
 from echolume_processing.hybrid.grid import OpticalGrid
 from echolume_processing.hybrid.model import HybridMap, Registration, empty_cells
 from echolume_processing.hybrid.scipy_typed import Mask
+from echolume_processing.hybrid.witnesses import Triggers, Witnesses, tabled
 
 Image = NDArray[np.float64]
 COUNT_LIMIT = np.iinfo(np.uint16).max
 
 
 class Cells:
-    """The cells of a map in the making; all images have the shape of the field."""
+    """The cells of a map in the making; all images have the shape of the field.
 
-    def __init__(self, field: MapField) -> None:
+    Parameters
+    ----------
+    field
+        The raster of cells.
+    stripes
+        Stripes that light's points in each cell are of.
+    pings
+        Pings that sound's height in each cell is of: one by cell, or a table of them.
+    """
+
+    def __init__(self, field: MapField, stripes: Witnesses, pings: Triggers | Witnesses) -> None:
         self._field = field
+        self._stripes = stripes
+        self._pings = pings if isinstance(pings, Witnesses) else _one_a_cell(pings.ravel())
         self._cells = empty_cells(field)
         self._view = self._cells.reshape(field.shape)
 
@@ -67,9 +81,23 @@ class Cells:
 
     def finish(self, *notes: str, registration: Registration | None = None) -> HybridMap:
         """The map."""
-        return HybridMap(self._field, self._cells, registration or Registration(), notes)
+        cells = self._cells
+        stripes = self._stripes.only(cells["optical_n"] > 0)
+        pings = self._pings.only(cells["ultrasonic_n"] > 0)
+        if stripes.which.size:
+            cells["stripe_first"], cells["stripe_last"] = stripes.first, stripes.last
+        if pings.which.size:
+            cells["ping"] = pings.first
+        cells["probability"] = certainty.by_rule(cells["label"])
+        return HybridMap(self._field, cells, registration or Registration(), notes, stripes, pings)
 
     def _claim(self, where: Mask, height_mm: Image, sigma_mm: Image, label: Label) -> None:
         self._view["front_mm"][where] = height_mm[where]
         self._view["sigma_mm"][where] = sigma_mm[where]
         self._view["label"][where] = label
+
+
+def _one_a_cell(triggers: Triggers) -> Witnesses:
+    """A table of at most one trigger a cell; no table if there is none at all."""
+    there = np.flatnonzero(triggers != NO_TRIGGER)
+    return tabled(there, triggers[there], triggers.size) if there.size else Witnesses()

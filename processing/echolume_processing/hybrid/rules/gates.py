@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from echolume_messages.calibration import ArrayCalibration
 from echolume_messages.types import Label
 from echolume_processing.hybrid import holes
 from echolume_processing.hybrid.model import HybridMap
+from echolume_processing.hybrid.rules.band import footprint_mm, slips
 from echolume_processing.hybrid.rules.cells import Cells
 from echolume_processing.hybrid.rules.plain import weighted
-from echolume_processing.hybrid.rules.scan import Scan, SoundImage
+from echolume_processing.hybrid.rules.scan import Scan
+from echolume_processing.hybrid.rules.sound import SoundImage, disk
 from echolume_processing.hybrid.scipy_typed import Mask, labelled, opened
 
 GATE = 2.5
@@ -20,10 +23,10 @@ GATE = 2.5
 SOUND_SIGMA_MM = 1.0
 """Of a contact point's height, whatever lies below it."""
 OCCLUDED_SIGMA_MM = 2.0
+LINES_CELLS = 5
+"""Side of the square whose median removes lines."""
 REGION_MM = 9.0
 LEAST_MM2 = 150.0
-NARROW = 0.3
-"""Below this relative bandwidth a contact point may be off by whole half wavelengths."""
 """A square of this side fits into every part of a region, and it is at least this large."""
 
 
@@ -37,7 +40,9 @@ def constant_gate(scan: Scan) -> HybridMap:
     """
     closed = holes.close(scan.light)
     sigma_mm = np.full(scan.field.shape, SOUND_SIGMA_MM)
-    return gated(scan, closed, SoundImage(scan.sound.height_mm, sigma_mm)).finish(*slips(scan.calibration.array))
+    return gated(scan, closed, replace(scan.sound, sigma_mm=sigma_mm)).finish(
+        *slips(scan.calibration.array, bool(scan.pings))
+    )
 
 
 def footprint_gate(scan: Scan) -> HybridMap:
@@ -46,45 +51,30 @@ def footprint_gate(scan: Scan) -> HybridMap:
     Notes
     -----
     The variance of a contact point grows by ((highest - lowest) / 2)^2 of light's surface within its footprint. Glass
-    lower than about two and a half times that is missed; a beam that is wider than calibrated is not forgiven.
+    lower than about two and a half times that is missed; a beam that is wider than calibrated is not forgiven. Light's
+    large holes count as the lower ground beside them: most of them are strips beside a plate, and with the height that
+    sound gives them the plate would have its own rim for relief.
     """
     closed = holes.close(scan.light)
     radius_mm, whence = footprint_mm(scan.calibration.array)
-    surface_mm = closed.height_mm.copy()
-    for hole in closed.absorbing:
-        heard = hole & np.isfinite(scan.sound.height_mm)
-        surface_mm[heard] = scan.sound.height_mm[heard]
-    relief_mm = relief(surface_mm, radius_mm, scan.field.cell_mm)
-    variance = scan.sound.sigma_mm**2 + SOUND_SIGMA_MM**2 + (0.5 * relief_mm) ** 2
-    sound = SoundImage(scan.sound.height_mm, np.sqrt(variance))
+    relief_mm = relief(without_lines(closed.height_mm), radius_mm, scan.field.cell_mm)
+    variance = scan.sound.stated_mm**2 + SOUND_SIGMA_MM**2 + (0.5 * relief_mm) ** 2
+    sound = replace(scan.sound, sigma_mm=np.sqrt(variance))
     note = f"footprint of {radius_mm:.1f} mm radius, {whence}"
-    return gated(scan, closed, sound, whole=True).finish(note, *slips(scan.calibration.array))
+    return gated(scan, closed, sound, whole=True).finish(note, *slips(scan.calibration.array, bool(scan.pings)))
 
 
-def slips(array: ArrayCalibration) -> tuple[str, ...]:
-    """What a gate cannot know of heights from a narrow band."""
-    if array.high_hz - array.low_hz >= NARROW * array.low_hz:
-        return ()
-    half_wave_mm = 1e3 * array.speed_of_sound_mps / (array.low_hz + array.high_hz)
-    return (f"narrow band: heights found by sound may be off by n x {half_wave_mm:.2f} mm, and no gate can tell",)
-
-
-def footprint_mm(array: ArrayCalibration) -> tuple[float, str]:
-    """Radius of an array's footprint at its reference distance, and where it comes from."""
-    if isinstance(array.footprint_mm, float):
-        return array.footprint_mm, "as calibrated"
-    wave_mm = 2e3 * array.speed_of_sound_mps / (array.low_hz + array.high_hz)
-    return float(np.sqrt(wave_mm * array.reference_mm / 2)), "the first Fresnel zone: none was calibrated"
+def without_lines(height_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Heights without what is at most two cells wide: light sees the rim of a plate as a line at its height."""
+    image = np.ascontiguousarray(height_mm, dtype=np.float32)
+    return np.asarray(cv2.medianBlur(image, LINES_CELLS), dtype=np.float64)
 
 
 def relief(height_mm: NDArray[np.float64], radius_mm: float, cell_mm: float) -> NDArray[np.float64]:
     """Highest less lowest height within a radius of each cell, of the image's shape."""
-    reach = max(1, round(radius_mm / cell_mm))
-    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
-    disk = ((x**2 + y**2) * cell_mm**2 <= radius_mm**2).astype(np.uint8)
-    disk[reach, reach] = 1
     image = np.ascontiguousarray(height_mm, dtype=np.float32)
-    return np.asarray(cv2.dilate(image, disk) - cv2.erode(image, disk), dtype=np.float64)
+    within = disk(radius_mm, cell_mm)
+    return np.asarray(cv2.dilate(image, within) - cv2.erode(image, within), dtype=np.float64)
 
 
 def regions(flagged: Mask, cell_mm: float) -> Mask:
@@ -98,6 +88,8 @@ def regions(flagged: Mask, cell_mm: float) -> Mask:
 
 def gated(scan: Scan, closed: holes.Closed, sound: SoundImage, whole: bool = False) -> Cells:
     """Light, sound in its large holes, and transparent where sound is higher by more than the gate.
+
+    Whether it is, the contact points say; how high, `Scan.settled`.
 
     Parameters
     ----------
@@ -119,15 +111,17 @@ def gated(scan: Scan, closed: holes.Closed, sound: SoundImage, whole: bool = Fal
         agree = seen & heard & (np.abs(difference_mm) <= limit_mm)
     if whole:
         above = regions(above, scan.field.cell_mm)
-    cells = with_holes(scan, closed, sound)
+    front = replace(scan.settled, sigma_mm=sound.sigma_mm)
+    above &= np.isfinite(front.height_mm)
+    cells = with_holes(scan, closed, front)
     cells.both(light, *weighted(light.height_mm, light.sigma_mm, sound.height_mm, sound.sigma_mm), agree & ~above)
-    cells.transparent(light, sound.height_mm, sound.sigma_mm, above)
+    cells.transparent(light, front.height_mm, front.sigma_mm, above)
     return cells
 
 
 def with_holes(scan: Scan, closed: holes.Closed, sound: SoundImage) -> Cells:
     """Light where it was seen; of its holes the large ones from sound, the narrow ones from their lower neighbour."""
-    cells = Cells(scan.field)
+    cells = Cells(scan.field, scan.light.stripes, sound.ping)
     cells.light(scan.light, closed.seen)
     cells.occluded(closed.height_mm, OCCLUDED_SIGMA_MM, closed.occluded)
     heard = np.isfinite(sound.height_mm)

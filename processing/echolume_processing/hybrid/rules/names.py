@@ -9,7 +9,7 @@ DEFAULT = SYNTHESIS
 
 DESCRIPTIONS: Mapping[str, str] = {
     "optical": "light alone: the median of a cell's optical points",
-    "ultrasonic": "sound alone: the nearest contact point within 20 mm",
+    "ultrasonic": "sound alone: the nearest contact point within 20 mm that stands over what it hears",
     "union": "the paper's hybrid image: the mean of all points in a cell, whichever sense they come from",
     "inverse-variance": "light and the nearest contact point, weighted by their stated variances",
     "constant-gate": "sound of 1 mm standard deviation against light: what it finds higher is transparent",

@@ -10,22 +10,24 @@ from echolume_processing.hybrid.baselines import union as union_mm
 from echolume_processing.hybrid.grid import STEPS_PER_MM, cell_index
 from echolume_processing.hybrid.model import HybridMap
 from echolume_processing.hybrid.rules.cells import Cells
-from echolume_processing.hybrid.rules.scan import LEAST_SIGMA_MM, Scan, sigma_of
+from echolume_processing.hybrid.rules.scan import Scan
+from echolume_processing.hybrid.rules.sound import LEAST_SIGMA_MM, sigma_of
 from echolume_processing.hybrid.scipy_typed import Mask
+from echolume_processing.hybrid.witnesses import Witnesses, tabled
 
 BLIND = "says nothing of glass or black: no sense is asked about the other"
 
 
 def optical(scan: Scan) -> HybridMap:
     """Light alone."""
-    cells = Cells(scan.field)
+    cells = Cells(scan.field, scan.light.stripes, Witnesses())
     cells.light(scan.light, np.isfinite(scan.light.height_mm))
     return cells.finish(f"light alone {BLIND}")
 
 
 def ultrasonic(scan: Scan) -> HybridMap:
     """Sound alone: heights without a label."""
-    cells = Cells(scan.field)
+    cells = Cells(scan.field, Witnesses(), scan.sound.ping)
     cells.sound(scan.sound.height_mm, scan.sound.sigma_mm, np.isfinite(scan.sound.height_mm))
     return cells.finish(f"sound alone {BLIND}")
 
@@ -45,7 +47,7 @@ def union(scan: Scan) -> HybridMap:
     number = light + sound
     sigma_mm = np.sqrt(variance) / np.maximum(number, 1)
     provenance = scan.light.provenance | np.where(sound > 0, np.uint8(Provenance.ULTRASONIC), np.uint8(0))
-    cells = Cells(scan.field)
+    cells = Cells(scan.field, scan.light.stripes, places.pings(scan))
     height_mm = union_mm(scan.optical, scan.ultrasonic, scan.field)
     cells.mixed(height_mm, np.maximum(sigma_mm, LEAST_SIGMA_MM), provenance, number > 0)
     cells.counts(light, sound)
@@ -61,7 +63,7 @@ def inverse_variance(scan: Scan) -> HybridMap:
     """
     light, sound = scan.light, scan.sound
     lit, heard = np.isfinite(light.height_mm), np.isfinite(sound.height_mm)
-    cells = Cells(scan.field)
+    cells = Cells(scan.field, light.stripes, sound.ping)
     cells.light(light, lit & ~heard)
     cells.sound(sound.height_mm, sound.sigma_mm, heard & ~lit)
     cells.both(light, *weighted(light.height_mm, light.sigma_mm, sound.height_mm, sound.sigma_mm), lit & heard)
@@ -93,6 +95,13 @@ class _Places:
         x_mm, y_mm = (np.where(np.isfinite(points[name]), points[name], np.float32(1e9)) for name in ("x_mm", "y_mm"))
         cell = cell_index(scan.field, x_mm, y_mm)
         return np.where(np.isfinite(points["z_mm"]), cell, -1)
+
+    def pings(self, scan: Scan) -> Witnesses:
+        """Pings whose contact points lie in each cell; no table where their triggers are not known."""
+        if scan.soundings is None:
+            return Witnesses()
+        there = self.sound >= 0
+        return tabled(self.sound[there], scan.soundings[there], self._size)
 
     def number(self, cell: NDArray[np.int64]) -> NDArray[np.int64]:
         return np.bincount(cell[cell >= 0], minlength=self._size).reshape(self._shape)

@@ -15,6 +15,7 @@ from echolume_processing.hybrid.rules.gates import constant_gate, footprint_gate
 from echolume_processing.hybrid.rules.names import DESCRIPTIONS, SYNTHESIS
 from echolume_processing.hybrid.rules.plain import inverse_variance, optical, ultrasonic, union
 from echolume_processing.hybrid.rules.scan import Scan
+from echolume_processing.hybrid.witnesses import Triggers
 from echolume_processing.ping import Ping
 
 Rule = Callable[[Scan], HybridMap]
@@ -22,7 +23,7 @@ Rule = Callable[[Scan], HybridMap]
 
 def synthesis(scan: Scan) -> HybridMap:
     """Analysis by synthesis of the echoes; see `fuse`."""
-    return fuse(scan.optical, scan.pings, scan.calibration, scan.field)
+    return fuse(scan.optical, scan.pings, scan.calibration, scan.field, scan.stripes)
 
 
 RULES: Mapping[str, Rule] = {
@@ -58,6 +59,8 @@ def fuse_by(
     pings: Sequence[Ping],
     calibration: Calibration,
     field: MapField,
+    stripes: Triggers | None = None,
+    soundings: Triggers | None = None,
 ) -> HybridMap:
     """Make the map of a scan by a rule.
 
@@ -75,6 +78,9 @@ def fuse_by(
         What the scan was made with.
     field
         Cells of the map.
+    stripes, soundings
+        Trigger of the stripe of each optical point (n,), and of the ping of each contact point (m,); without them the
+        cells name none.
 
     Returns
     -------
@@ -87,4 +93,4 @@ def fuse_by(
     ConfigError
         There is no such rule.
     """
-    return named(name)(Scan(optical, ultrasonic, pings, calibration, field))
+    return named(name)(Scan(optical, ultrasonic, pings, calibration, field, stripes, soundings))

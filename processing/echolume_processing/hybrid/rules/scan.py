@@ -6,27 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
-from numpy.typing import NDArray
-
 from echolume_messages.calibration import Calibration
 from echolume_messages.plan import MapField
 from echolume_messages.types import Structured
-from echolume_processing.hybrid.baselines import nearest_points
 from echolume_processing.hybrid.grid import OpticalGrid, accumulate
+from echolume_processing.hybrid.rules.band import narrow
+from echolume_processing.hybrid.rules.onsets import by_onset
+from echolume_processing.hybrid.rules.sound import SoundImage, sound_image
+from echolume_processing.hybrid.witnesses import Triggers
 from echolume_processing.ping import Ping
-
-DOUBTFUL_MM = 5.0
-"""Standard deviation of a contact point that no surface explains, and that therefore states none."""
-LEAST_SIGMA_MM = 0.01
-
-
-@dataclass(frozen=True)
-class SoundImage:
-    """What contact points say of each cell; images of the field's shape, nan beyond their reach."""
-
-    height_mm: NDArray[np.float64]
-    sigma_mm: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -40,31 +28,27 @@ class Scan:
     pings: Sequence[Ping]
     calibration: Calibration
     field: MapField
+    stripes: Triggers | None = None
+    """Trigger of the stripe of each optical point (n,), if known."""
+    soundings: Triggers | None = None
+    """Trigger of the ping of each contact point (m,), if known."""
+    grid: OpticalGrid | None = None
+    """Light's cells, where they are made already."""
 
     @cached_property
     def light(self) -> OpticalGrid:
         """Light's cells."""
-        return accumulate(self.optical, self.field)
+        return self.grid or accumulate(self.optical, self.field, self.stripes)
 
     @cached_property
     def sound(self) -> SoundImage:
-        """The nearest contact point of each cell."""
-        return sound_image(self.ultrasonic, self.field)
+        """The nearest contact point of each cell that stands over what it hears."""
+        return sound_image(self.ultrasonic, self.calibration.array, self.field, self.soundings)
 
-
-def sigma_of(points: Structured) -> NDArray[np.float64]:
-    """Standard deviation of the height of contact points (n,), mm; `DOUBTFUL_MM` where they state none."""
-    variance = points["zz_mm2"].astype(np.float64)
-    stated = np.isfinite(variance) & (variance > 0)
-    sigma_mm = np.sqrt(np.where(stated, variance, DOUBTFUL_MM**2))
-    return np.asarray(np.clip(sigma_mm, LEAST_SIGMA_MM, DOUBTFUL_MM), dtype=np.float64)
-
-
-def sound_image(points: Structured, field: MapField) -> SoundImage:
-    """Height and standard deviation of the nearest contact point of each cell."""
-    height_mm, sigma_mm = np.full(field.shape, np.nan), np.full(field.shape, np.nan)
-    ordered, index = nearest_points(points, field)
-    found = index < ordered.size
-    height_mm[found] = ordered["z_mm"][index[found]]
-    sigma_mm[found] = sigma_of(ordered)[index[found]]
-    return SoundImage(height_mm, sigma_mm)
+    @cached_property
+    def settled(self) -> SoundImage:
+        """The same with whole waves chosen by the echoes' beginnings: of a narrow band, if there are pings."""
+        if not (narrow(self.calibration.array) and self.pings):
+            return self.sound
+        points, triggers = by_onset(self.pings, self.calibration)
+        return sound_image(points, self.calibration.array, self.field, triggers)

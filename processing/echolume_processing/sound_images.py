@@ -11,7 +11,7 @@ from echolume_messages.errors import ConfigError
 from echolume_messages.geometry import Points3
 from echolume_messages.types import Structured
 from echolume_processing.sound_scan import SoundScan
-from echolume_processing.ultrasonic.edges import Edge, canny, edge_segments, edges_in_rig
+from echolume_processing.ultrasonic.edges import Edge, edges_in_rig
 from echolume_processing.ultrasonic.gray import (
     GrayImage,
     GrayScale,
@@ -21,6 +21,7 @@ from echolume_processing.ultrasonic.gray import (
     threshold,
     unsharp,
 )
+from echolume_processing.ultrasonic.hough import canny, edge_segments
 from echolume_processing.ultrasonic.interpolate import INTERPOLATIONS, DepthMap, Interpolation
 from echolume_processing.ultrasonic.raster import Raster, spacing_mm
 

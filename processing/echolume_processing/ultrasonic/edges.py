@@ -1,4 +1,4 @@
-"""Straight edges of a gray-level image, and back in three dimensions with what is not known about them."""
+"""Straight edges of a gray-level image back in three dimensions, with what is not known about them."""
 
 from __future__ import annotations
 
@@ -9,26 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echolume_messages.geometry import require_shape
-from echolume_processing.ultrasonic.gray import GrayImage
 from echolume_processing.ultrasonic.interpolate import DepthMap
 from echolume_processing.ultrasonic.raster import Raster
 
 REACH = 1.5
 """An edge is looked for so many sampling distances to either side of its segment."""
+BESIDE_PX = 3
+"""The higher side begins within so many pixels of a segment: rims of a coarse scan have teeth."""
 MAX_LEAN = 0.35
 """The measured edge may lean this much off its segment, no more (a Hough segment is good to a few pixels)."""
-
-
-def canny(image: GrayImage, low: int = 40, high: int = 120) -> GrayImage:
-    """Canny's edges, 255 on them."""
-    return np.asarray(cv2.Canny(image, low, high), dtype=np.uint8)
-
-
-def edge_segments(image: GrayImage, min_length_px: int, max_gap_px: int = 4, votes: int = 20) -> NDArray[np.float64]:
-    """Straight edges by Canny and the Hough transform, rows x1, y1, x2, y2 in pixels, (segments, 4)."""
-    edges = canny(image)
-    found = cv2.HoughLinesP(edges, 1, np.pi / 180, votes, minLineLength=min_length_px, maxLineGap=max_gap_px)
-    return np.zeros((0, 4)) if found is None else np.asarray(found, dtype=np.float64).reshape(-1, 4)
 
 
 def segments_to_rig(segments_px: NDArray[np.float64], heights_mm: DepthMap, raster: Raster) -> NDArray[np.float64]:
@@ -41,7 +30,7 @@ def segments_to_rig(segments_px: NDArray[np.float64], heights_mm: DepthMap, rast
     require_shape("segments_px", segments_px, (None, 4))
     require_shape("heights_mm", heights_mm, (raster.rows, raster.columns))
     ends = segments_px.reshape(-1, 2, 2)
-    top = cv2.dilate(heights_mm.astype(np.float32), np.ones((3, 3), dtype=np.uint8))
+    top = cv2.dilate(heights_mm.astype(np.float32), np.ones((2 * BESIDE_PX + 1,) * 2, dtype=np.uint8))
     column = np.clip(np.rint(ends[..., 0]), 0, raster.columns - 1).astype(np.int64)
     row = np.clip(np.rint(ends[..., 1]), 0, raster.rows - 1).astype(np.int64)
     x = raster.x0_mm + raster.pixel_mm * ends[..., 0]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from echolume_processing.ultrasonic.edges import Edge, canny, edge_segments, edges_in_rig, segments_to_rig
+from echolume_processing.ultrasonic.edges import Edge, edges_in_rig, segments_to_rig
 from echolume_processing.ultrasonic.gray import (
     GrayImage,
     GrayScale,
@@ -12,6 +12,7 @@ from echolume_processing.ultrasonic.gray import (
     threshold,
     unsharp,
 )
+from echolume_processing.ultrasonic.hough import canny, edge_segments
 from echolume_processing.ultrasonic.interpolate import (
     INTERPOLATIONS,
     DepthMap,

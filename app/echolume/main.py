@@ -31,6 +31,7 @@ SUMMARIES = {
     "image": "acoustic images of a scan, and the volume by delay-and-sum",
     "export": "write a hybrid map as PLY, LAS, E57, mesh or npz",
     "evaluate": "score a hybrid map against the truth",
+    "explain": "tell what one cell of a map is, and what it rests on",
     "localise": "locate a target in recorded echoes of a 1+N array",
 }
 

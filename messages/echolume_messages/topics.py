@@ -87,7 +87,19 @@ ULTRASONIC_POINTS = Topic(
     "contact points of one ping",
 )
 HYBRID_MAP = Topic(
-    "hybrid", "map", types.MAP_CELL, (None,), 0.01, False, False, 1, 64 * _MIB, "cells of the hybrid map"
+    "hybrid", "map", types.MAP_CELL, (None,), 0.01, False, False, 1, 128 * _MIB, "cells of the hybrid map"
+)
+HYBRID_GROWING = Topic(
+    "hybrid",
+    "growing",
+    types.MAP_CELL,
+    (None,),
+    0.5,
+    False,
+    False,
+    1,
+    64 * _MIB,
+    "cells of the map of what came so far, by the footprint gate",
 )
 HYBRID_DONE = _json("hybrid", "done", 0.01, False, "the map is written: files, digest, counts, lag")
 
@@ -113,6 +125,7 @@ TOPICS: tuple[Topic, ...] = (
     OPTICAL_POINTS,
     ULTRASONIC_POINTS,
     HYBRID_MAP,
+    HYBRID_GROWING,
     HYBRID_DONE,
     *(health(s) for s in (*SERVICES[1:], *SUBSCRIBERS)),
 )

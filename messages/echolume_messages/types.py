@@ -92,6 +92,9 @@ ULTRASONIC_POINT = np.dtype(
 The covariance is not a number where no surface explains the ping, infinite along what the array's layout leaves open,
 and without what the calibration leaves uncertain, which is the same for all pings."""
 
+NO_TRIGGER = 0xFFFFFFFF
+"""Stands where a cell names no trigger: they are numbered from 0."""
+
 MAP_CELL = np.dtype(
     [
         ("ix", "<i2"),
@@ -102,7 +105,11 @@ MAP_CELL = np.dtype(
         ("label", "u1"),  # Label
         ("provenance", "u1"),  # Provenance
         ("optical_n", "<u2"),  # optical points in the cell
-        ("ultrasonic_n", "<u2"),  # pings that the cell rests on
+        ("ultrasonic_n", "<u2"),  # pings that the cell's height rests on
+        ("probability", "<f4"),  # that the label is right; 0 for UNKNOWN, nan where nobody said
+        ("stripe_first", "<u4"),  # lowest trigger of the stripes with points in the cell; NO_TRIGGER: none is known
+        ("stripe_last", "<u4"),  # highest of them
+        ("ping", "<u4"),  # trigger of the ping nearest to the cell of those that explain it; NO_TRIGGER: none
     ]
 )
 """A cell of the hybrid map; x_mm = x0_mm + (ix + 0.5) cell_mm, likewise y."""

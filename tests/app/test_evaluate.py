@@ -21,6 +21,7 @@ from echolume.evaluation.fits import fit_plane, fit_sphere, without_worst
 from echolume.evaluation.images import Claimed, Reference, reference
 from echolume.evaluation.picture import picture
 from echolume.evaluation.regions import regions
+from echolume.evaluation.reliability import right
 from echolume.evaluation.steps import height_of_step
 from echolume.evaluation.table import table
 from echolume.main import main
@@ -247,6 +248,50 @@ def test_fits_return_what_was_put_in_and_refuse_what_holds_nothing() -> None:
     assert without_worst(np.zeros(300), 0.003).all()
 
 
+def test_labels_as_right_as_they_say_have_no_calibration_error(case: Case) -> None:
+    rng = np.random.default_rng(8)
+    stated = rng.choice([0.25, 0.75, 0.97, 0.9992], FIELD.shape)
+    wrong = rng.random(FIELD.shape) > stated
+    case.image["probability"][:] = stated
+    case.image["label"][wrong] = (case.image["label"][wrong] % 3) + 1
+    found = case.scores()["reliability"]
+    assert found is not None
+    assert found["cells"] == stated.size
+    assert found["right"] == pytest.approx(1 - wrong.mean())
+    assert found["label_ece"] < 0.006
+    assert found["label_brier"] == pytest.approx(float(np.mean(stated * (1 - stated))), rel=0.03)
+    assert [(row["low"], row["high"]) for row in found["bins"]] == [(0.2, 0.3), (0.7, 0.8), (0.95, 0.98), (0.999, 1.0)]
+    for row in found["bins"]:
+        assert row["right"] == pytest.approx(row["stated"], abs=0.02)
+    assert "calibration error" in table(case.scores())
+
+
+def test_labels_that_are_surer_than_right_have_that_calibration_error(case: Case) -> None:
+    case.image["probability"][:] = 1.0
+    case.image["label"][:, :50] = Label.ABSORBING
+    share = float((case.truth.label[:, :50] != Label.ABSORBING).sum() / case.truth.label.size)
+    found = case.scores()["reliability"]
+    assert found is not None
+    assert found["label_ece"] == pytest.approx(share)
+    assert found["label_brier"] == pytest.approx(share)
+
+
+def test_probabilities_of_unknown_cells_and_those_not_stated_do_not_count(case: Case) -> None:
+    case.image["probability"][:] = np.nan
+    assert case.scores()["reliability"] is None
+    case.image["probability"][0, :30] = 0.5
+    case.image["label"][0, :10] = Label.UNKNOWN
+    found = case.scores()["reliability"]
+    assert found is not None
+    assert found["cells"] == 20
+
+
+def test_occluded_is_right_over_what_light_should_have_seen() -> None:
+    label = np.array([Label.OCCLUDED, Label.OCCLUDED, Label.OCCLUDED, Label.MATTE, Label.MATTE, Label.TRANSPARENT])
+    truth = np.array([Label.MATTE, Label.TRANSPARENT, Label.ABSORBING, Label.OCCLUDED, Label.MATTE, Label.UNKNOWN])
+    assert right(label, truth).tolist() == [True, False, False, True, True, False]
+
+
 def test_recall_precision_and_confusion_are_those_imposed(case: Case) -> None:
     label = case.image["label"]
     glass, black = (np.argwhere(case.truth.label == kind) for kind in (Label.TRANSPARENT, Label.ABSORBING))
@@ -330,6 +375,7 @@ def test_scores_of_heights_are_those_of_the_report(case: Case) -> None:
 def test_a_layer_has_heights_only(case: Case) -> None:
     found = case.scores("optical_mm")
     assert (found["labels"], found["confusion"], found["glass"], found["provenance"]) == (None, None, None, None)
+    assert found["reliability"] is None
     assert found["consistency"]["all"]["nees"] is None
     assert list(found["metrology"]["steps_by_sense"]) == ["unstated"]
 

@@ -13,16 +13,18 @@ import numpy as np
 import plyfile
 import pye57
 import pytest
+from numpy.lib.recfunctions import repack_fields
 from numpy.typing import NDArray
 
 from echolume.main import main
 from echolume_messages.errors import ConfigError
-from echolume_messages.types import MAP_CELL, Label
+from echolume_messages.types import MAP_CELL, NO_TRIGGER, Label
 from echolume_processing.export import e57, formats, las, mesh, npz
 from echolume_processing.hybrid import ply, stored
 from echolume_processing.hybrid.digest import digest
 from echolume_processing.hybrid.model import HybridMap, cell_centres_mm, empty_cells
 from echolume_processing.hybrid.stored import StoredMap
+from echolume_processing.hybrid.witnesses import PAIR, Witnesses, tabled
 from processing.some_map import FIELD, NOTES, some_map
 
 ENDINGS = [known.ending for known in formats.FORMATS]
@@ -53,6 +55,15 @@ def assert_same_fields(
             np.testing.assert_array_equal(bits(np.asarray(read[name])), bits(cells[name]), err_msg=name)
 
 
+def assert_same_tables(again: StoredMap, kept: StoredMap) -> None:
+    for name in ("stripes", "pings"):
+        read, wrote = getattr(again.found, name), getattr(kept.found, name)
+        assert wrote.which.size > 1000
+        for part in ("start", "which"):
+            assert getattr(read, part).dtype == getattr(wrote, part).dtype
+            np.testing.assert_array_equal(getattr(read, part), getattr(wrote, part), err_msg=f"{name}.{part}")
+
+
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_a_map_is_read_back_identical_with_what_is_known_about_it(ending: str, tmp_path: Path) -> None:
     kept = some_map()
@@ -61,6 +72,8 @@ def test_a_map_is_read_back_identical_with_what_is_known_about_it(ending: str, t
         np.testing.assert_array_equal(bits(again.found.cells[name]), bits(kept.found.cells[name]), err_msg=name)
     assert (again.found.field, again.found.registration) == (FIELD, kept.found.registration)
     assert (again.found.notes, again.scan, again.calibration) == (NOTES, kept.scan, kept.calibration)
+    assert_same_tables(again, kept)
+    assert digest(again.found) == digest(kept.found)
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
@@ -226,12 +239,13 @@ def test_pye57_opens_e57_with_every_field_in_metres(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read["rowIndex"], cells["iy"])
     np.testing.assert_array_equal(read["columnIndex"], cells["ix"])
     np.testing.assert_array_equal(read["colorBlue"], ply.LABEL_RGB[cells["label"], 2])
-    extra = {name: np.zeros(cells.size, MAP_CELL[name]) for name in FIELDS}
+    wider = {"<u4": "q"}  # pye57 takes no uint32
+    extra = {name: np.zeros(cells.size, wider.get(MAP_CELL[name].str, MAP_CELL[name])) for name in FIELDS}
     buffers = libe57.VectorSourceDestBuffer()
     for name, column in extra.items():
         buffers.append(libe57.SourceDestBuffer(file.image_file, f"echolume:{name}", column, cells.size, True, True))
     header.points.reader(buffers).read()
-    assert_same_fields(extra, cells)
+    assert_same_fields({name: column.astype(MAP_CELL[name]) for name, column in extra.items()}, cells)
     assert header.zMaximum == pytest.approx(cells["front_mm"].max() / 1e3, abs=1e-12)
     about = json.loads(file.root["echolume:about"].value())
     assert (about["digest"], about["notes"]) == (digest(kept.found), list(NOTES))
@@ -246,6 +260,94 @@ def test_numpy_opens_npz_with_every_field_an_image(tmp_path: Path) -> None:
         assert json.loads(str(read["about"]))["labels"]["transparent"] == Label.TRANSPARENT
     again = npz.read(tmp_path / "map.npz")
     np.testing.assert_array_equal(again.layers["optical_mm"], kept.layers["optical_mm"])
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_table_without_triggers_is_not_the_same_as_none(ending: str, tmp_path: Path) -> None:
+    some = some_map()
+    empty = tabled(np.zeros(0, np.int64), np.zeros(0, np.uint32), some.found.cells.size)
+    kept = replace(some, found=replace(some.found, stripes=empty, pings=Witnesses()))
+    again = formats.read(made(tmp_path / f"map{ending}", kept)).found
+    assert (again.stripes.known, again.stripes.which.size, again.pings.known) == (True, 0, False)
+
+
+def of_format_1(path: Path) -> str:
+    """What a file said about its map before cells had probabilities and triggers."""
+    found = replace(some_map().found, stripes=Witnesses(), pings=Witnesses())
+    about = json.loads(stored.About.of(some_map()).text())
+    return json.dumps({**about, "format": 1, "digest": digest(found, stored.names_of(1))})
+
+
+def assert_nobody_said(again: StoredMap) -> None:
+    cells = again.found.cells
+    known = cells["label"] != Label.UNKNOWN
+    assert np.isnan(cells["probability"][known]).all()
+    assert (cells["probability"][~known] == 0).all()
+    for name in ("stripe_first", "stripe_last", "ping"):
+        assert (cells[name] == NO_TRIGGER).all()
+    assert again.found.stripes.which.size == again.found.pings.which.size == 0
+    for name in stored.names_of(1):
+        np.testing.assert_array_equal(bits(cells[name]), bits(some_map().found.cells[name]), err_msg=name)
+
+
+def test_an_npz_of_before_there_were_probabilities_is_read_and_holds_none(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with np.load(made(tmp_path / "map.npz")) as read:
+        held = {name: read[name] for name in read.files if name not in (*stored.ADDED[2], *npz.TABLES)}
+    np.savez(tmp_path / "old.npz", **{**held, "about": np.array(of_format_1(tmp_path))})
+    assert_nobody_said(npz.read(tmp_path / "old.npz"))
+    del held["about"]
+    np.savez(tmp_path / "older.npz", **held)
+    assert_nobody_said(npz.read(tmp_path / "older.npz"))
+    assert "its cells are not those" not in caplog.text
+
+
+def test_a_cloud_of_before_there_were_probabilities_is_read_and_holds_none(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    read = plyfile.PlyData.read(str(made(tmp_path / "map.ply")), mmap=False)
+    elements = []
+    for element in read.elements[:2]:
+        names = [name for name in element.data.dtype.names if name not in stored.ADDED[2]]
+        elements.append(plyfile.PlyElement.describe(repack_fields(element.data[names]), element.name))
+    plyfile.PlyData(elements, comments=[f"about:{of_format_1(tmp_path)}"], byte_order="<").write(
+        str(tmp_path / "o.ply")
+    )
+    assert_nobody_said(formats.read(tmp_path / "o.ply"))
+    assert "its cells are not those" not in caplog.text
+
+
+def test_a_file_of_a_format_to_come_is_refused(tmp_path: Path) -> None:
+    with np.load(made(tmp_path / "map.npz")) as read:
+        about = json.loads(str(read["about"]))
+        text = np.array(json.dumps({**about, "format": stored.FORMAT + 1}))
+        np.savez(tmp_path / "new.npz", **{**{k: read[k] for k in read.files}, "about": text})
+    with pytest.raises(ConfigError, match=r"new\.npz: is of format 3"):
+        npz.read(tmp_path / "new.npz")
+
+
+@pytest.mark.parametrize(
+    ("name", "table", "said"),
+    [
+        ("stripe_start", np.zeros(7, np.int64), "does not divide"),
+        ("stripe_start", np.zeros(FIELD.shape[0] * FIELD.shape[1] + 1, np.int64), "does not divide"),
+        ("ping_start", np.zeros(7, np.int32), "expected int64"),
+        ("ping_ids", np.zeros(7, np.int64), "expected int64 and uint32"),
+        ("ping_ids", None, "only one of"),
+    ],
+)
+def test_an_npz_with_a_wrong_table_is_refused(name: str, table: NDArray[Any] | None, said: str, tmp_path: Path) -> None:
+    with np.load(made(tmp_path / "map.npz")) as read:
+        held = {k: read[k] for k in read.files if k != name}
+    np.savez(tmp_path / "bad.npz", **(held if table is None else {**held, name: table}))
+    with pytest.raises(ConfigError, match=said):
+        npz.read(tmp_path / "bad.npz")
+
+
+def test_triggers_of_cells_beyond_the_field_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="beyond its field"):
+        stored.table_of(np.array([(60 * 80, 1)], dtype=PAIR), FIELD, tmp_path)
 
 
 def test_an_npz_of_an_earlier_version_has_no_origin(tmp_path: Path) -> None:

@@ -41,7 +41,7 @@ def _terminate(number: int, frame: FrameType | None) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the demo; 0 only if the ledger closes, the archive is whole and the map beats each sensor alone."""
+    """Run the demo; 0 only if the ledger closes, the archive is whole and no sensor alone beats the map."""
     signal.signal(signal.SIGTERM, _terminate)
     signal.signal(signal.SIGHUP, _terminate)
     from echolume.demo.run import DemoSettings, run_demo

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echolume import scoring
-from echolume.evaluation import consistency, form, images, labels, sensors, steps
+from echolume.evaluation import consistency, form, images, labels, reliability, sensors, steps
 from echolume.evaluation.images import Claimed, Reference
 from echolume.evaluation.regions import regions
 from echolume_messages.errors import ConfigError
@@ -76,6 +76,7 @@ class Evaluation(TypedDict):
     non_edge: scoring.Scores
     labels: dict[str, labels.LabelScore] | None
     confusion: dict[str, dict[str, int]] | None
+    reliability: reliability.Reliability | None
     glass: labels.Glass | None
     consistency: ConsistencyRows
     metrology: Metrology
@@ -133,6 +134,7 @@ def evaluate(map_: Claimed, truth: Reference, field: MapField, sources: Sources)
         non_edge=scoring.score(map_.front_mm, map_.label, there, smooth),
         labels=None if map_.label is None else labels.label_scores(map_.label, truth.label),
         confusion=None if map_.label is None else labels.confusion(map_.label, truth.label),
+        reliability=reliability.reliability(map_, truth),
         glass=labels.glass(map_, truth, field),
         consistency=_consistency(map_, truth, scored, smooth),
         metrology=metrology(map_, truth, field),

@@ -32,6 +32,8 @@ class Claimed:
     sigma_mm: NDArray[np.float64] | None = None
     label: NDArray[np.int64] | None = None
     provenance: NDArray[np.int64] | None = None
+    probability: NDArray[np.float64] | None = None
+    """That the label is right; nan where the map does not say."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +72,7 @@ def claimed(stored: StoredMap, layer: str | None, path: Path) -> Claimed:
             image("sigma_mm").astype(np.float64),
             image("label").astype(np.int64),
             image("provenance").astype(np.int64),
+            image("probability").astype(np.float64),
         )
     if not np.isfinite(found.front_mm).any():
         raise ConfigError(f"{path}: no cell of the map has a height; there is nothing to score")

@@ -39,6 +39,7 @@ def _parts(found: Evaluation) -> Iterable[str]:
             ("truth is / map says", *next(iter(confusion.values()))),
             [(name, *row.values()) for name, row in confusion.items()],
         )
+    yield _reliability(found)
     yield _glass(found)
     rows = found["consistency"]
     sensors = rows["sensors"] or {}
@@ -53,6 +54,23 @@ def _parts(found: Evaluation) -> Iterable[str]:
     if shares:
         yield f"Cells with a height that name no sensor: {100 * shares['none']:.2f} %"
     yield from _metrology(found)
+
+
+def _reliability(found: Evaluation) -> str:
+    said = found["reliability"]
+    if said is None:
+        return ""
+    keys = ("cells", "stated", "right")
+    return "\n".join(
+        [
+            f"Labels' probabilities, {said['cells']} cells: {said['right']:.4f} are right, Brier score "
+            f"{said['label_brier']:.5f}, calibration error {said['label_ece']:.5f}",
+            _rows(
+                ("probability", *keys),
+                [(f"{row['low']:g} to {row['high']:g}", *(row[key] for key in keys)) for row in said["bins"]],
+            ),
+        ]
+    )
 
 
 def _glass(found: Evaluation) -> str:

@@ -23,10 +23,13 @@ from echolume_processing.hybrid.stored import (
     About,
     StoredMap,
     blocks,
+    lines_of,
     put_back,
+    table_of,
     unmeasured,
     with_height,
 )
+from echolume_processing.hybrid.witnesses import PAIR, Witnesses
 
 libe57: Any = importlib.import_module("pye57.libe57")  # compiled, without types
 PREFIX, URI = "echolume", "urn:echolume:e57:1"
@@ -41,7 +44,7 @@ POINT = np.dtype(
         *((f"{PREFIX}:{name}", RECORD[name].str) for name in RECORD.names or ()),
     ]
 )
-SILENT = np.dtype([(f"{PREFIX}:{name}", RECORD[name].str) for name in RECORD.names or ()])
+LINE = np.dtype([(f"{PREFIX}:{name}", PAIR[name].str) for name in PAIR.names or ()])
 
 
 def write(stored: StoredMap, path: Path) -> int:
@@ -50,7 +53,8 @@ def write(stored: StoredMap, path: Path) -> int:
     Notes
     -----
     Coordinates are metres in double precision, as E57 has it; the heights in mm are in ``echolume:front_mm`` once more,
-    bit for bit. JSON about the map is ``/echolume:about``, the cells without a height are ``/echolume:unmeasured``.
+    bit for bit. JSON about the map is ``/echolume:about``, the cells without a height are ``/echolume:unmeasured``, the
+    triggers that cells rest on ``/echolume:stripes`` and ``/echolume:pings``.
 
     Raises
     ------
@@ -86,9 +90,18 @@ def _write(file: Any, stored: StoredMap, points: NDArray[np.bool_]) -> None:
     found = stored.found
     vector = _vector(file, scan, "points", POINT)
     scans.append(scan)
-    silent = _vector(file, root, f"{PREFIX}:unmeasured", SILENT)
+    record = _record(RECORD.names or ())
+    silent = _vector(file, root, f"{PREFIX}:unmeasured", record)
+    tables = {name: _vector(file, root, f"{PREFIX}:{name}", LINE) for name in lines_of(found)}
     _fill(file, vector, POINT, (_points(found, cells) for cells in blocks(found, points)))
-    _fill(file, silent, SILENT, [unmeasured(found).view(SILENT)])
+    _fill(file, silent, record, [unmeasured(found).view(record)])
+    for name, lines in lines_of(found).items():
+        _fill(file, tables[name], LINE, [lines.view(LINE)])
+
+
+def _record(names: Iterable[str]) -> np.dtype[np.void]:
+    """Records of cells by the names that they have in the file."""
+    return np.dtype([(f"{PREFIX}:{name}", RECORD[name].str) for name in names])
 
 
 def _root(about: About) -> dict[str, Any]:
@@ -157,7 +170,8 @@ def _vector(file: Any, parent: Any, name: str, dtype: np.dtype[np.void]) -> Any:
 
 
 def _buffers(file: Any, dtype: np.dtype[np.void], size: int) -> tuple[dict[str, NDArray[Any]], Any]:
-    columns = {name: np.zeros(size, dtype=dtype[name]) for name in dtype.names or ()}
+    kinds = {name: np.dtype(np.longlong) if dtype[name] == np.uint32 else dtype[name] for name in dtype.names or ()}
+    columns = {name: np.zeros(size, dtype=kind) for name, kind in kinds.items()}  # the library takes no uint32
     buffers = libe57.VectorSourceDestBuffer()
     for name, column in columns.items():
         buffers.append(libe57.SourceDestBuffer(file, name, column, size, True, True))
@@ -208,25 +222,41 @@ def read(path: Path) -> StoredMap:
         if not root.isDefined(f"{PREFIX}:about"):
             raise ConfigError(f"{path}: does not say which field its points lie on; expected E57 by `echolume`")
         about = About.parse(root[f"{PREFIX}:about"].value(), path)
-        points = _column(file, root["data3D"][0]["points"])
-        silent = _column(file, root[f"{PREFIX}:unmeasured"])
+        points = _cells(file, root["data3D"][0]["points"], about)
+        silent = _cells(file, root[f"{PREFIX}:unmeasured"], about)
+        stripes, pings = (_table(file, root, name, about, path) for name in ("stripes", "pings"))
     except (libe57.E57Exception, KeyError) as error:
         raise ConfigError(f"{path}: cannot be read as a map's E57 (damaged?): {error}") from error
     finally:
         file.close()
-    return about.stored(put_back(about, [points, silent], path), path)
+    return about.stored(put_back(about, [points, silent], path), path, stripes=stripes, pings=pings)
 
 
-def _column(file: Any, vector: Any) -> Structured:
+def _cells(file: Any, vector: Any, about: About) -> Structured:
     """Records of cells from a vector of the file."""
-    size = int(vector.childCount())
-    cells = np.zeros(size, dtype=RECORD)
-    if not size:
-        return cells
-    columns, buffers = _buffers(file, SILENT, size)
+    columns = _columns(file, vector, _record(about.names))
+    cells = np.zeros(int(vector.childCount()), dtype=RECORD)
+    for name in about.names:
+        cells[name] = columns[f"{PREFIX}:{name}"]
+    return cells
+
+
+def _table(file: Any, root: Any, name: str, about: About, path: Path) -> Witnesses:
+    if not root.isDefined(f"{PREFIX}:{name}"):
+        return Witnesses()
+    columns = _columns(file, root[f"{PREFIX}:{name}"], LINE)
+    lines = np.zeros(columns[f"{PREFIX}:cell"].size, dtype=PAIR)
+    for key in PAIR.names or ():
+        lines[key] = columns[f"{PREFIX}:{key}"]
+    return table_of(lines, about.field, path)
+
+
+def _columns(file: Any, vector: Any, dtype: np.dtype[np.void]) -> dict[str, NDArray[Any]]:
+    """Every record of a vector of the file, by field."""
+    columns, buffers = _buffers(file, dtype, max(1, int(vector.childCount())))
+    if not vector.childCount():
+        return {name: column[:0] for name, column in columns.items()}
     reader = vector.reader(buffers)
     reader.read()
     reader.close()
-    for name in RECORD.names or ():
-        cells[name] = columns[f"{PREFIX}:{name}"]
-    return cells
+    return columns

@@ -17,10 +17,23 @@ from echolume_messages.files import replacing
 from echolume_messages.types import Structured
 from echolume_processing.hybrid.model import HybridMap, cell_centres_mm
 from echolume_processing.hybrid.ply import LABEL_RGB
-from echolume_processing.hybrid.stored import RECORD, About, StoredMap, blocks, put_back, unmeasured, with_height
+from echolume_processing.hybrid.stored import (
+    RECORD,
+    About,
+    StoredMap,
+    blocks,
+    lines_of,
+    put_back,
+    require_names,
+    table_of,
+    unmeasured,
+    with_height,
+)
+from echolume_processing.hybrid.witnesses import PAIR, Witnesses
 
 USER = "echolume"
 ABOUT_ID, UNMEASURED_ID = 1, 2
+TABLE_IDS = {"stripes": 3, "pings": 4}
 POINT_FORMAT = 7
 """Colour, and no place for a waveform."""
 FINEST_M = 1e-9
@@ -33,7 +46,11 @@ MEANING = {
     "label": "what the cell is, see VLR",
     "provenance": "bits of the senses, see VLR",
     "optical_n": "optical points in the cell",
-    "ultrasonic_n": "pings that the cell rests on",
+    "ultrasonic_n": "pings that the height rests on",
+    "probability": "that the label is right",
+    "stripe_first": "lowest trigger of its stripes",
+    "stripe_last": "highest trigger of its stripes",
+    "ping": "trigger of the nearest ping",
 }
 
 
@@ -43,8 +60,8 @@ def write(stored: StoredMap, path: Path) -> int:
     Notes
     -----
     Coordinates are metres, as LAS has it, in integers of ``scale_m``: 1 nm for heights and fields up to 2 m. The
-    heights are in ``front_mm`` once more, bit for bit. JSON about the map and the records of cells without a height
-    (NPY) are extended VLRs of user ``echolume``, 1 and 2.
+    heights are in ``front_mm`` once more, bit for bit. Extended VLRs of user ``echolume`` are: 1, JSON about the map;
+    2 to 4 (NPY), the records of cells without a height, and the triggers of the stripes and pings that cells rest on.
     """
     found = stored.found
     points = with_height(found)
@@ -52,17 +69,25 @@ def write(stored: StoredMap, path: Path) -> int:
     with replacing(path) as fresh, laspy.open(str(fresh), "w", header=header, do_compress=False) as sink:
         for cells in blocks(found, points):
             sink.write_points(_points(found, cells, header))
-        records = io.BytesIO()
-        np.save(records, unmeasured(found), allow_pickle=False)
         sink.write_evlrs(
             VLRList(
                 [
                     laspy.VLR(USER, ABOUT_ID, "JSON about the map", About.of(stored).text().encode("ascii")),
-                    laspy.VLR(USER, UNMEASURED_ID, "NPY: cells without a height", records.getvalue()),
+                    laspy.VLR(USER, UNMEASURED_ID, "NPY: cells without a height", _npy(unmeasured(found))),
+                    *(
+                        laspy.VLR(USER, TABLE_IDS[name], f"NPY: triggers of {name} by cell", _npy(lines))
+                        for name, lines in lines_of(found).items()
+                    ),
                 ]
             )
         )
     return int(points.sum())
+
+
+def _npy(records: Structured) -> bytes:
+    into = io.BytesIO()
+    np.save(into, records, allow_pickle=False)
+    return into.getvalue()
 
 
 def scale_m(found: HybridMap) -> float:
@@ -118,15 +143,22 @@ def read(path: Path) -> StoredMap:
             points = source.read_points(-1)
             if len(points) != source.header.point_count:
                 raise ConfigError(f"{path}: is cut short: {len(points)} of {source.header.point_count} points")
-            names = set(source.header.point_format.dimension_names)
-            missing = [name for name in RECORD.names or () if name not in names]
-            if missing:
-                raise ConfigError(f"{path}: lacks {', '.join(missing)}; expected every field of a map's cells")
+            about = About.parse(known[ABOUT_ID].decode("ascii", "replace"), path)
+            require_names(set(source.header.point_format.dimension_names), about, path)
             cells = np.zeros(len(points), dtype=RECORD)
-            for name in RECORD.names or ():
+            for name in about.names:
                 cells[name] = points[name]
             silent = np.load(io.BytesIO(known[UNMEASURED_ID]), allow_pickle=False)
+            stripes, pings = (_table(known, name, about, path) for name in TABLE_IDS)
     except (laspy.errors.LaspyException, ValueError, KeyError, EOFError) as error:
         raise ConfigError(f"{path}: cannot be read as a map's LAS (cut short or damaged?): {error}") from error
-    about = About.parse(known[ABOUT_ID].decode("ascii", "replace"), path)
-    return about.stored(put_back(about, [cells, silent], path), path)
+    return about.stored(put_back(about, [cells, silent], path), path, stripes=stripes, pings=pings)
+
+
+def _table(known: dict[int, bytes], name: str, about: About, path: Path) -> Witnesses:
+    if TABLE_IDS[name] not in known:
+        return Witnesses()
+    lines = np.load(io.BytesIO(known[TABLE_IDS[name]]), allow_pickle=False)
+    if lines.dtype != PAIR:
+        raise ConfigError(f"{path}: {name}: expected lines of cell and trigger, got {lines.dtype}")
+    return table_of(lines, about.field, path)

@@ -14,7 +14,7 @@ from echolume_messages.types import Label, Structured
 from echolume_processing.hybrid import ply
 from echolume_processing.hybrid.model import HybridMap
 from echolume_processing.hybrid.ply import FACE
-from echolume_processing.hybrid.stored import BLOCK, StoredMap, unmeasured
+from echolume_processing.hybrid.stored import BLOCK, StoredMap, lines_of, unmeasured
 
 STEEPEST = 2.0
 """Rise over run beyond which two cells are the two sides of a step, of which nothing was measured: 63 degrees."""
@@ -108,13 +108,20 @@ def write(stored: StoredMap, path: Path, walls: bool = False) -> int:
     count = sum(part.size for sheet in both for part in _faces(sheet, tallest_mm, 0))
     vertices = firsts[1] + int(np.isfinite(both[1].height_mm).sum())
     silent = unmeasured(found)
-    elements = [("vertex", vertices, VERTEX), ("unmeasured", silent.size, np.dtype(ply.KEPT)), ("face", count, FACE)]
+    elements = [
+        ("vertex", vertices, VERTEX),
+        ("unmeasured", silent.size, np.dtype(ply.KEPT)),
+        *ply.tables(found),
+        ("face", count, FACE),
+    ]
     with replacing(path) as fresh, fresh.open("wb") as sink:
         sink.write(ply.header(stored, elements))
         for sheet in both:
             for part in _vertices(found, sheet):
                 sink.write(part.tobytes())
         sink.write(ply.kept(silent).tobytes())
+        for lines in lines_of(found).values():
+            sink.write(lines.tobytes())
         for sheet, first in zip(both, firsts, strict=True):
             for part in _faces(sheet, tallest_mm, first):
                 sink.write(part.tobytes())

@@ -15,7 +15,7 @@ from echolume_processing.hybrid.rules.registry import fuse_by
 OPTICAL, ULTRASONIC = 1_000_000, 10_000
 HALF_MM = 150.0
 FIELD = MapField(x_mm=(-HALF_MM, HALF_MM), y_mm=(-HALF_MM, HALF_MM), cell_mm=1.0)
-ROUNDS = 3
+ROUNDS = 5
 TIMED = ("optical", "ultrasonic", "union", "inverse-variance", "constant-gate", "footprint-gate")
 """The rules that rest on points alone."""
 
@@ -50,7 +50,7 @@ def plain_union(light: Structured, sound: Structured) -> np.ndarray:
 
 
 def fusion_speed_rows(calibration: Calibration) -> dict[str, float]:
-    """Median seconds of each way, all taking turns."""
+    """Least seconds of each way, all taking turns: what else the machine does only adds."""
     light, sound = some_points()
     ways: Mapping[str, Callable[[], object]] = {
         "plain numpy union": lambda: plain_union(light, sound),
@@ -62,11 +62,11 @@ def fusion_speed_rows(calibration: Calibration) -> dict[str, float]:
             began_s = time.perf_counter()
             work()
             spent[name].append(time.perf_counter() - began_s)
-    median = {name: float(np.median(each)) for name, each in spent.items()}
+    least = {name: min(each) for name, each in spent.items()}
     print(f"\n{OPTICAL:.0e} + {ULTRASONIC:.0e} points{'s':>16}{'times numpy':>13}")
-    for name, each in median.items():
-        print(f"{name:24}{each:14.3f}{each / median['plain numpy union']:13.1f}")
+    for name, each in least.items():
+        print(f"{name:24}{each:14.3f}{each / least['plain numpy union']:13.1f}")
     return {
-        "fuse_s": median["footprint-gate"],
-        "fuse_x_numpy_union": median["footprint-gate"] / median["plain numpy union"],
+        "fuse_s": least["footprint-gate"],
+        "fuse_x_numpy_union": least["footprint-gate"] / least["plain numpy union"],
     }

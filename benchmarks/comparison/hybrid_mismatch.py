@@ -1,4 +1,7 @@
-"""The rules under a calibration that is not the array's: beam, speed of sound, frequency, noise."""
+"""The rules under a calibration that is not the array's: beam, speed of sound, frequency; and with more noise.
+
+Recorded echoes stay as they are, only the calibration is altered; of the last row the noise is, and nothing else.
+"""
 
 from __future__ import annotations
 
@@ -8,19 +11,25 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
+from comparison.hybrid_asked import DISTURBED
 from comparison.hybrid_scans import Recorded
 from comparison.hybrid_scores import Row, fused, mean_of, row
 from echolume_messages.calibration import ArrayCalibration, Calibration
-from echolume_processing.hybrid.rules.gates import footprint_mm
+from echolume_messages.geometry import rotation_from_vector, transform
+from echolume_processing.hybrid.rules.band import footprint_mm
 from echolume_processing.ping import Ping
 from echolume_processing.ultrasonic.pipeline import UltrasonicPipeline
 
 QUIET_SHARE = 0.1
 """The last part of a record, where no echo comes any more."""
 SIX_DB = 2.0
+OFF_MM = np.array([-0.5, -0.5, 0.5])
+OFF_DEG = np.array([-0.2, 0.2, -0.2])
+OFF_K = 3.0
 
 
 def _beam(array: ArrayCalibration, scale: float) -> ArrayCalibration:
+    """A beam is as wide as its aperture is small: `radius_mm` is the piston's, from which echoes are predicted."""
     footprint = footprint_mm(array)[0] * scale
     return msgspec.structs.replace(array, radius_mm=array.radius_mm / scale, footprint_mm=footprint)
 
@@ -39,6 +48,14 @@ def _frequency(array: ArrayCalibration, scale: float) -> ArrayCalibration:
     )
 
 
+def _set_up(array: ArrayCalibration, scale: float) -> ArrayCalibration:
+    """A robot whose frame is off by `OFF_MM` and `OFF_DEG`, in air that is `OFF_K` warmer or colder than thought."""
+    off = transform(rotation_from_vector(np.radians(OFF_DEG) * scale), OFF_MM * scale)
+    return msgspec.structs.replace(
+        array, rig_from_robot=(off @ array.robot_pose).tolist(), temperature_c=array.temperature_c + OFF_K * scale
+    )
+
+
 ARRAYS: Mapping[str, tuple[str, float]] = {
     "as calibrated": ("beam", 1.0),
     "beam 30 % wider": ("beam", 1.3),
@@ -47,9 +64,11 @@ ARRAYS: Mapping[str, tuple[str, float]] = {
     "speed of sound - 0.5 %": ("speed", 0.995),
     "frequency + 2 %": ("frequency", 1.02),
     "noise + 6 dB": ("noise", SIX_DB),
+    DISTURBED: ("set-up", 1.0),
+    f"{DISTURBED}, the other way": ("set-up", -1.0),
 }
 """What is altered, and by which factor; the first is altered in nothing."""
-ALTER = {"beam": _beam, "speed": _speed, "frequency": _frequency}
+ALTER = {"beam": _beam, "speed": _speed, "frequency": _frequency, "set-up": _set_up}
 
 
 def altered(calibration: Calibration, kind: str, scale: float) -> Calibration:

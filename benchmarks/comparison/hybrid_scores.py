@@ -12,6 +12,7 @@ from comparison.hybrid_scans import Recorded
 from echolume import scoring
 from echolume.evaluation import images
 from echolume.evaluation.evaluate import Evaluation, Metrology, Sources, evaluate, metrology
+from echolume_drivers.emulated.expectations import Said, judge
 from echolume_messages.calibration import Calibration
 from echolume_messages.types import Label, Structured
 from echolume_processing.hybrid.model import HybridMap
@@ -62,6 +63,7 @@ def row(found: HybridMap, recorded: Recorded) -> Row:
     glass = said["glass"] or {}
     hidden = truth.label == Label.UNKNOWN
     within = said["consistency"]["non_edge"]
+    stated = said["reliability"] or {}
     matte = replace(truth, front_mm=np.where(truth.label == Label.MATTE, truth.front_mm, np.nan))
     made = metrology(claimed, matte, field)
     return {
@@ -76,13 +78,51 @@ def row(found: HybridMap, recorded: Recorded) -> Row:
         "glass_height_mm": _number(glass.get("median_abs_mm")),
         "transparent_pct": 100 * float(np.mean(label == Label.TRANSPARENT)),
         "hidden_unknown_pct": 100 * float(np.mean(label[hidden] == Label.UNKNOWN)) if hidden.any() else NAN,
+        "label_brier": _number(stated.get("label_brier")),
+        "label_ece": _number(stated.get("label_ece")),
         "nees": _number(within["nees"]),
         "nees_median": _number(within["nees_median"]),
         "coverage95_pct": 100 * _number(within["coverage95"]),
         "step_light_mm": _step(made, "light"),
         "step_sound_mm": _step(made, "sound"),
         "flatness_mm": _number(made["flatness_mm"]),
+        **plate_rows(found, recorded),
     }
+
+
+def plate_rows(found: HybridMap, recorded: Recorded) -> Row:
+    """Recall and median error of the height of each region of glass: ``REGION_recall``, ``REGION_mm``."""
+    if recorded.asked is None:
+        return {}
+    truth, asked, rows = recorded.truth, recorded.asked, Row()
+    named = found.image("label") == Label.TRANSPARENT
+    off_mm = np.abs(found.image("front_mm") - truth.front_mm)
+    for number, region in enumerate(asked.regions):
+        cells = (asked.region == number) & (truth.label == Label.TRANSPARENT)
+        if not cells.any():
+            continue
+        name, claimed = region.replace("-", "_"), named & cells & np.isfinite(off_mm)
+        rows[f"{name}_recall"] = float(named[cells].mean())
+        rows[f"{name}_mm"] = float(np.median(off_mm[claimed])) if claimed.any() else NAN
+    return rows
+
+
+def broken(found: HybridMap, recorded: Recorded) -> list[Said]:
+    """What a map does not say, of that which the scene asks of it."""
+    asked = recorded.asked
+    if asked is None:
+        return []
+    said = judge(
+        asked.expect,
+        asked.regions,
+        asked.region,
+        found.image("label"),
+        found.image("front_mm"),
+        recorded.truth.front_mm,
+        asked.behind_mm,
+        found.field.cell_mm,
+    )
+    return [each for each in said if not each.kept]
 
 
 def _step(made: Metrology, sense: str) -> float:
@@ -98,7 +138,7 @@ def _number(value: object) -> float:
 def mean_of(rows: list[Row]) -> Row:
     """Mean of each figure over the rows that have it."""
     out: Row = {}
-    for key in rows[0] if rows else ():
-        values = [row[key] for row in rows if key in row and np.isfinite(row[key])]
+    for key in dict.fromkeys(key for each in rows for key in each):
+        values = [each[key] for each in rows if key in each and np.isfinite(each[key])]
         out[key] = float(np.mean(values)) if values else NAN
     return out

@@ -110,7 +110,7 @@ def test_a_perfect_map_keeps_every_expectation(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["demo", "glass-tilt-10", "glass-steep", "glass-two", "mirror", "bottle", "glass-stair"]
+    "name", ["demo", "glass-tilt-10", "glass-steep", "glass-small", "glass-two", "mirror", "bottle", "glass-stair"]
 )
 def test_a_map_of_light_alone_breaks_the_expectations(name: str) -> None:
     scene = SCENES[name]()

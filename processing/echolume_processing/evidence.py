@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from echolume_messages.bus import Message
 from echolume_messages.calibration import Calibration
@@ -71,15 +72,19 @@ class Evidence:
         found.review.utc_offset_ns = start.utc_offset_ns
         return found
 
-    def add_optical(self, trigger: int, attempt: int, points: Structured) -> None:
-        """Points of one stripe."""
-        if attempt >= self.optical.get(trigger, (-1, points))[0]:
+    def add_optical(self, trigger: int, attempt: int, points: Structured) -> bool:
+        """Points of one stripe; whether they count, no later attempt having come."""
+        counts = attempt >= self.optical.get(trigger, (-1, points))[0]
+        if counts:
             self.optical[trigger] = (attempt, points)
+        return counts
 
-    def add_ping(self, trigger: int, attempt: int, ping: Ping) -> None:
-        """Raw echoes of one ping."""
-        if attempt >= self.pings.get(trigger, (-1, ping))[0]:
+    def add_ping(self, trigger: int, attempt: int, ping: Ping) -> bool:
+        """Raw echoes of one ping; whether they count, no later attempt having come."""
+        counts = attempt >= self.pings.get(trigger, (-1, ping))[0]
+        if counts:
             self.pings[trigger] = (attempt, ping)
+        return counts
 
     def add_ultrasonic(self, trigger: int, attempt: int, points: Structured) -> None:
         """Contact points of one ping."""
@@ -90,9 +95,17 @@ class Evidence:
         """Optical points (n,) sorted by trigger."""
         return _joined((self.optical[k][1] for k in sorted(self.optical)), OPTICAL_POINT)
 
+    def optical_triggers(self) -> NDArray[np.uint32]:
+        """Trigger of the stripe that each of `all_optical` is of (n,)."""
+        return _triggers(self.optical)
+
     def all_ultrasonic(self) -> Structured:
         """Contact points (n,) sorted by trigger."""
         return _joined((self.ultrasonic[k][1] for k in sorted(self.ultrasonic)), ULTRASONIC_POINT)
+
+    def ultrasonic_triggers(self) -> NDArray[np.uint32]:
+        """Trigger of the ping that each of `all_ultrasonic` is of (n,)."""
+        return _triggers(self.ultrasonic)
 
     def all_pings(self) -> list[Ping]:
         """Pings sorted by trigger."""
@@ -107,6 +120,12 @@ class Evidence:
             "active_right": int((source == OpticalSource.ACTIVE_RIGHT).sum()),
             "ultrasonic": int(self.all_ultrasonic().size),
         }
+
+
+def _triggers(parts: Mapping[int, tuple[int, Structured]]) -> NDArray[np.uint32]:
+    """Triggers of parts, each as often as it has points."""
+    keys = np.array(sorted(parts), dtype=np.uint32)
+    return np.repeat(keys, [parts[int(k)][1].size for k in keys])
 
 
 def _joined(parts: Iterable[Structured], dtype: np.dtype[np.void]) -> Structured:

@@ -21,6 +21,7 @@ from echolume_processing.export import npz
 from echolume_processing.hybrid import ply, recording
 from echolume_processing.hybrid.baselines import Baselines, baselines
 from echolume_processing.hybrid.digest import digest
+from echolume_processing.hybrid.growing import GrowingMap
 from echolume_processing.hybrid.model import HybridMap
 from echolume_processing.hybrid.rules import registry
 from echolume_processing.hybrid.rules.names import DEFAULT
@@ -135,14 +136,26 @@ def gather(archive: Path, progress: Progress = silent, start: ScanStart | None =
 
 
 def conclude(
-    evidence: Evidence, out: Path, progress: Progress = silent, rule: str = DEFAULT
+    evidence: Evidence,
+    out: Path,
+    progress: Progress = silent,
+    rule: str = DEFAULT,
+    grown: GrowingMap | None = None,
 ) -> tuple[HybridMap, Results]:
-    """Fuse gathered evidence and write the map: ``hybrid.ply``, ``map.npz``, ``hybrid.rrd``, ``figures/*.png``."""
+    """Fuse gathered evidence and write the map: ``hybrid.ply``, ``map.npz``, ``hybrid.rrd``, ``figures/*.png``.
+
+    A map that grew with the same evidence is finished instead of fused by a rule: it is the default rule's.
+    """
     out.mkdir(parents=True, exist_ok=True)
     progress("fusing", 0, 3)
     optical, ultrasonic = evidence.all_optical(), evidence.all_ultrasonic()
-    pings, field = evidence.all_pings(), evidence.plan.map
-    found = registry.fuse_by(rule, optical, ultrasonic, pings, evidence.calibration, field)
+    field = evidence.plan.map
+    if grown is not None:
+        found = grown.finish()
+    else:
+        triggers = evidence.optical_triggers(), evidence.ultrasonic_triggers()
+        pings = evidence.all_pings()
+        found = registry.fuse_by(rule, optical, ultrasonic, pings, evidence.calibration, field, *triggers)
     others = baselines(optical, ultrasonic, field)
     progress("writing", 1, 3)
     calibration = evidence.calibration.digest

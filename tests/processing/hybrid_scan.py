@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -20,7 +21,8 @@ from echolume_processing.ping import Ping
 FIELD = MapField(x_mm=(-48.0, 48.0), y_mm=(-48.0, 48.0), cell_mm=1.0)
 TEMPERATURE_C = 22.0
 REFERENCE_MM = 150.0
-BEFORE, AFTER = 48, 112
+BEFORE = 48
+AFTER = {"wideband": 112, "paper": 360}
 FIRST_PING = 1000
 
 
@@ -49,10 +51,12 @@ def all_matte() -> Scene:
     return replace(scene, name="small-matte", optical_mm=scene.front_mm, material=np.zeros_like(scene.material))
 
 
-def small_scan(scene: Scene, seed: int = 1, pitch_mm: float = 12.0) -> SmallScan:
+def small_scan(
+    scene: Scene, seed: int = 1, pitch_mm: float = 12.0, pulse: Literal["wideband", "paper"] = "wideband"
+) -> SmallScan:
     """Scan a scene; the calibration is a little wrong, as a real one is."""
     rng = np.random.default_rng(seed)
-    settings = ArraySettings(port="")
+    settings = ArraySettings(port="", pulse=pulse)
     truth = array_truth(seed, settings)
     poses = np.array(raster(UltrasonicPass(name="s", x_mm=(-48, 48), y_mm=(-48, 48), pitch_mm=pitch_mm, height_mm=150)))
     pings = [
@@ -69,9 +73,14 @@ def small_scan(scene: Scene, seed: int = 1, pitch_mm: float = 12.0) -> SmallScan
     return SmallScan(scene, _optical(scene, rng), pings, calibration_of(settings, truth, rng))
 
 
+def triggers(points: np.ndarray) -> np.ndarray:
+    """Trigger of the stripe that each optical point is of."""
+    return np.round(points["x_mm"] + 200).astype(np.uint32)
+
+
 def stripes(points: np.ndarray) -> dict[int, np.ndarray]:
     """Optical points by the stripe that they belong to."""
-    number = np.round(points["x_mm"] + 200).astype(int)
+    number = triggers(points)
     return {int(k): points[number == k] for k in np.unique(number)}
 
 
@@ -98,7 +107,9 @@ def calibration_of(settings: ArraySettings, truth: ArrayTruth, rng: np.random.Ge
     speed_mps = speed_of_sound_mps(TEMPERATURE_C)
     arrival = (path_mm / (speed_mps * 1e3) + truth.delays_s) * settings.sample_rate_hz - BEFORE
     turn = np.exp(2j * np.pi * np.fft.rfftfreq(record.shape[1]) * arrival[:, None])
-    templates = np.fft.irfft(np.fft.rfft(record, axis=1) * turn, n=record.shape[1], axis=1)[:, : BEFORE + AFTER]
+    templates = np.fft.irfft(np.fft.rfft(record, axis=1) * turn, n=record.shape[1], axis=1)[
+        :, : BEFORE + AFTER[settings.pulse]
+    ]
     templates[:, -24:] *= np.cos(np.linspace(0, np.pi / 2, 24))
     moved = truth.flange_from_array @ transform(np.eye(3), np.array([0.06, -0.05, 0.07]))
     camera = CameraCalibration(

@@ -24,6 +24,7 @@ def some_map() -> HybridMap:
     cells["provenance"][:10] = Provenance.STEREO
     cells["label"][3], cells["behind_mm"][3], cells["provenance"][3] = Label.TRANSPARENT, -1.5, Provenance.ULTRASONIC
     cells["sigma_mm"][:10], cells["optical_n"][:10], cells["ultrasonic_n"][3] = 0.25, 700, 12
+    cells["probability"][:10], cells["stripe_first"][:10], cells["stripe_last"][:10], cells["ping"][3] = 0.9, 7, 8, 512
     return HybridMap(FIELD, cells, Registration(), ("two heights",))
 
 

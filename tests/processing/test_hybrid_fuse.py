@@ -10,13 +10,13 @@ from scipy import ndimage
 from echolume_drivers.emulated import scene_file
 from echolume_drivers.emulated.scene import Material, SceneBuilder
 from echolume_messages.calibration import Calibration
-from echolume_messages.types import OPTICAL_POINT, Label, Provenance
-from echolume_processing.hybrid import kernels, surface, tiles
+from echolume_messages.types import NO_TRIGGER, OPTICAL_POINT, Label, Provenance
+from echolume_processing.hybrid import kernels, surface, tile_kernels
 from echolume_processing.hybrid.digest import digest
 from echolume_processing.hybrid.fuse import fuse
 from echolume_processing.hybrid.model import HybridMap
 from echolume_processing.hybrid.warm_up import warm_up
-from processing.hybrid_scan import FIELD, SmallScan, all_matte, glass_and_black, small_scan
+from processing.hybrid_scan import FIELD, FIRST_PING, SmallScan, all_matte, glass_and_black, small_scan, triggers
 
 RIM = 120 - 48
 
@@ -28,7 +28,7 @@ def scan() -> SmallScan:
 
 @pytest.fixture(scope="module")
 def found(scan: SmallScan) -> HybridMap:
-    return fuse(scan.optical, scan.pings, scan.calibration, FIELD)
+    return fuse(scan.optical, scan.pings, scan.calibration, FIELD, triggers(scan.optical))
 
 
 def cut(image: np.ndarray) -> np.ndarray:
@@ -58,8 +58,55 @@ def test_the_black_block_gets_its_height_from_sound(scan: SmallScan, found: Hybr
 def test_every_cell_with_a_height_names_its_source_and_no_other_does(found: HybridMap) -> None:
     claimed = np.isfinite(found.cells["front_mm"])
     assert (found.cells["provenance"][claimed] != Provenance.NONE).all()
-    assert (found.cells["label"][claimed] != Label.UNKNOWN).all()
     assert (found.cells["label"][~claimed] == Label.UNKNOWN).all()
+    unnamed = found.cells["provenance"][claimed & (found.cells["label"] == Label.UNKNOWN)]
+    assert (unnamed & Provenance.ULTRASONIC).all()  # only sound knows heights without knowing what is there
+
+
+def test_every_claimed_cell_has_witnesses_and_a_probability(found: HybridMap) -> None:
+    cells = found.cells
+    claimed, sound = cells["label"] != Label.UNKNOWN, (cells["provenance"] & Provenance.ULTRASONIC) != 0
+    stripes, pings = found.stripes.count, found.pings.count
+    assert claimed.any()
+    assert (stripes + pings > 0)[claimed].all()
+    assert (pings[sound] > 0).all()
+    assert ((stripes > 0) == (cells["optical_n"] > 0)).all()
+    assert (cells["probability"][claimed] > 0).all()
+    assert (cells["probability"][~claimed] == 0).all()
+    assert (cells["probability"] <= 1).all()
+
+
+def test_the_triggers_in_a_cell_are_those_of_its_tables(found: HybridMap) -> None:
+    cells = found.cells
+    np.testing.assert_array_equal(cells["stripe_first"], found.stripes.first)
+    np.testing.assert_array_equal(cells["stripe_last"], found.stripes.last)
+    assert ((cells["ping"] == NO_TRIGGER) == (found.pings.count == 0)).all()
+    for k in np.flatnonzero(cells["ping"] != NO_TRIGGER)[::97]:
+        assert cells["ping"][k] in found.pings.of(k)
+
+
+def test_the_stripes_of_a_cell_are_those_whose_line_runs_through_it(found: HybridMap) -> None:
+    x_mm = FIELD.x_mm[0] + (found.cells["ix"][found.stripes.cell] + 0.5) * FIELD.cell_mm
+    np.testing.assert_allclose(found.stripes.which.astype(float) - 200, x_mm, atol=0.51)
+
+
+def test_the_pings_of_a_cell_stood_near_to_it(scan: SmallScan, found: HybridMap) -> None:
+    cells = found.cells[found.pings.cell]
+    x_mm, y_mm = (start + (cells[name] + 0.5) * FIELD.cell_mm for name, start in (("ix", -48.0), ("iy", -48.0)))
+    pose = (
+        np.array([scan.calibration.array.rig_from_robot])
+        @ np.array([[*scan.pings[k - FIRST_PING].robot_pose[:3], 1.0] for k in found.pings.which])[:, :, None]
+    )
+    away_mm = np.hypot(pose[:, 0, 0] - x_mm, pose[:, 1, 0] - y_mm)
+    assert np.quantile(away_mm, 0.99) < 25
+
+
+def test_in_the_middle_of_a_plate_the_label_is_surer_than_at_its_rim(found: HybridMap) -> None:
+    named = found.image("label") == Label.TRANSPARENT
+    rim = named & ~ndimage.binary_erosion(named)
+    inner = ndimage.binary_erosion(named, iterations=5)
+    assert found.image("probability")[inner].min() > 0.97
+    assert found.image("probability")[rim].max() < 0.9
 
 
 def test_most_cells_are_right_to_a_millimetre(scan: SmallScan, found: HybridMap) -> None:
@@ -69,8 +116,11 @@ def test_most_cells_are_right_to_a_millimetre(scan: SmallScan, found: HybridMap)
 
 def test_the_order_of_arrival_does_not_matter(scan: SmallScan) -> None:
     order = np.random.default_rng(3).permutation(scan.optical.size)
-    one = fuse(scan.optical, scan.pings[::3], scan.calibration, FIELD)
-    two = fuse(scan.optical[order], scan.pings[::3][::-1], scan.calibration, FIELD)
+    light, number = scan.optical, triggers(scan.optical)
+    one = fuse(light, scan.pings[::3], scan.calibration, FIELD, number)
+    two = fuse(light[order], scan.pings[::3][::-1], scan.calibration, FIELD, number[order])
+    assert one.stripes.which.size
+    assert one.pings.which.size
     assert digest(one) == digest(two)
 
 
@@ -127,7 +177,19 @@ def test_a_hanging_plate_is_found_and_its_hole_stays_open() -> None:
     assert (glass & named).sum() / named.sum() > 0.9
     assert np.abs(found.image("front_mm")[named] - 26.0).max() < 0.3
     y, x = np.mgrid[-47.5:48.0, -47.5:48.0]
-    assert not named[np.hypot(x, y) < 11].any()
+    hole = np.hypot(x, y) < 11
+    assert np.isin(found.image("label")[hole], (Label.MATTE, Label.UNKNOWN)).all()
+    assert np.abs(found.image("front_mm")[hole]).max() < 1.0
+
+
+def test_a_plate_too_small_for_any_contact_point_is_found() -> None:
+    scan = small_scan(SceneBuilder("small").box((-10, 10), (-12, 8), 20.0, Material.GLASS).build(), pitch_mm=10.0)
+    found = fuse(scan.optical, scan.pings, scan.calibration, FIELD)
+    glass = cut(scan.scene.material) == Material.GLASS
+    named = found.image("label") == Label.TRANSPARENT
+    assert (glass & named).sum() / glass.sum() > 0.9
+    assert (glass & named).sum() / named.sum() > 0.9
+    assert np.abs(found.image("front_mm")[named] - 20.0).max() < 0.5
 
 
 def test_where_light_sees_next_to_nothing_sound_speaks_alone_and_is_not_registered() -> None:
@@ -161,5 +223,11 @@ def test_a_narrow_band_says_what_it_cannot_decide(scan: SmallScan) -> None:
 def test_the_warm_up_compiles_what_fusing_uses(found: HybridMap) -> None:
     assert found.cells.size
     warm_up()
-    for kernel in (kernels.lay_facets, kernels.lay_walls, surface._horizons, tiles._tile_spectra, tiles._solve_box):
+    for kernel in (
+        kernels.lay_facets,
+        kernels.lay_walls,
+        surface._horizons,
+        tile_kernels.tile_spectra,
+        tile_kernels.solve_box,
+    ):
         assert len(kernel.signatures) == 1, f"{kernel.__name__}: fusing and warm-up call it with other types"

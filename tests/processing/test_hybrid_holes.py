@@ -61,3 +61,33 @@ def test_nothing_seen_is_no_hole() -> None:
     closed = close(grid_of(np.full(FIELD.shape, np.nan)))
     assert closed.outside.all()
     assert not closed.seen.any()
+
+
+def test_a_strip_before_a_row_of_steps_gets_the_ground_before_them() -> None:
+    height_mm = np.zeros(FIELD.shape)
+    for step in range(3):
+        height_mm[20:40, 20 + 8 * step : 28 + 8 * step] = 10.0 * (step + 1)
+        height_mm[40 : 42 + 2 * step, 20 + 8 * step : 28 + 8 * step] = np.nan
+    closed = close(grid_of(height_mm))
+    assert (closed.height_mm[40:] == 0.0).all()
+
+
+def test_a_small_hole_in_level_ground_may_be_a_pit_and_is_not_filled() -> None:
+    height_mm = np.full(FIELD.shape, 20.0)
+    height_mm[20:24, 30:34] = np.nan
+    height_mm[10, 10] = np.nan
+    closed = close(grid_of(height_mm))
+    assert not closed.occluded[20:24, 30:34].any()
+    assert not closed.seen[20:24, 30:34].any()
+    assert closed.occluded[10, 10]
+
+
+def test_beside_a_steep_flank_nothing_is_guessed() -> None:
+    x_mm = np.arange(60) + 0.5
+    dome_mm = np.sqrt(np.maximum(0.0, 20.0**2 - (x_mm - 30) ** 2))
+    height_mm = np.tile(dome_mm, (50, 1))
+    height_mm[:, 10:14] = np.nan
+    closed = close(grid_of(height_mm))
+    assert not closed.occluded[:, 10:14].any()
+    height_mm[:, 14:46] = 20.0
+    assert close(grid_of(height_mm)).occluded[:, 10:14].all()

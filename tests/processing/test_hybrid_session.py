@@ -164,17 +164,21 @@ def test_an_archive_gives_a_map_and_every_file_that_it_names(reprocessed: tuple[
             assert maps[name].shape == shape, name
         claimed = np.isfinite(maps["front_mm"])
         assert np.abs(maps["front_mm"][claimed]).max() < 0.5
+        kinds = {p.name: p.__struct_config__.tag for p in PLAN.passes}
+        steps = {s.trigger: kinds[s.pass_name] for s in plans.expand(PLAN)}
+        assert {steps[t] for t in maps["stripe_ids"].tolist()} == {"optical"}
+        assert {steps[t] for t in maps["ping_ids"].tolist()} == {"ultrasonic"}
         assert plyfile.PlyData.read(str(out / "hybrid.ply"))["vertex"].count == claimed.sum()
 
 
 def test_the_rule_is_named_and_another_one_gives_another_map(
     recorded: Recorded, reprocessed: tuple[Path, dict[str, Any]], tmp_path: Path
 ) -> None:
-    alone = reprocess(recorded.archive, tmp_path, rule="ultrasonic")
-    assert (reprocessed[1]["rule"], alone["rule"]) == ("synthesis", "ultrasonic")
+    alone = reprocess(recorded.archive, tmp_path, rule="optical")
+    assert (reprocessed[1]["rule"], alone["rule"]) == ("synthesis", "optical")
     assert alone["digest"] != reprocessed[1]["digest"]
     with np.load(tmp_path / "map.npz") as maps:
-        np.testing.assert_array_equal(maps["front_mm"], maps["ultrasonic_mm"])
+        np.testing.assert_array_equal(maps["front_mm"], maps["optical_mm"])
 
 
 def test_the_recording_holds_points_map_and_notes(reprocessed: tuple[Path, dict[str, Any]], evidence: Evidence) -> None:
@@ -185,7 +189,7 @@ def test_the_recording_holds_points_map_and_notes(reprocessed: tuple[Path, dict[
     entities = {chunk.entity_path for chunk in chunks}
     wanted = {"st", "at_left", "at_right", "us", "hybrid"}
     assert {f"/rig/map/{name}" for name in wanted} <= entities
-    assert {"/us/echoes", "/us/level", "/notes", "/map/labels", "/map/height"} <= entities
+    assert {"/us/echoes", "/us/level", "/notes", "/map/labels", "/map/height", "/map/probability"} <= entities
     stereo = [chunk for chunk in chunks if chunk.entity_path == "/rig/map/st"]
     assert sum(chunk.to_record_batch().num_rows for chunk in stereo) == len(evidence.optical)
 
@@ -370,3 +374,20 @@ def test_live_points_in_any_order_give_the_digest_of_the_archive(
     assert cells is not None
     assert cells.header.calibration == recorded.calibration.digest
     assert (cells.payload["label"] != Label.TRANSPARENT).all()
+
+
+def test_while_a_scan_runs_its_map_grows(
+    live: Bus, recorded: Recorded, evidence: Evidence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hybrid, "SHOWN_EVERY_S", 0.0)
+    claimed = list[int]()
+    with live.subscribe([topics.HYBRID_GROWING], depth=64) as growing:
+        live.publisher(topics.SCAN_START).put(recorded.records[0].payload, scan=SCAN)
+        for trigger in sorted(evidence.optical)[:3]:
+            put(live, topics.OPTICAL_POINTS, evidence.optical[trigger][1], trigger, "light", Source())
+            found = growing.get(DEADLINE_S)
+            assert found is not None, "the map does not grow"
+            assert found.header.scan == SCAN
+            claimed.append(int(np.isfinite(found.payload["front_mm"]).sum()))
+    # The first stripe fills one column, and cells without neighbours count as noise.
+    assert claimed[0] < claimed[1] < claimed[2]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,47 +13,44 @@ from echolume_messages.plan import MapField
 from echolume_messages.types import Structured
 from echolume_processing.hybrid import holes
 from echolume_processing.hybrid.cells import Cells, wide_field
-from echolume_processing.hybrid.grid import accumulate
-from echolume_processing.hybrid.heard import Heard, Seed, heard, seeds
-from echolume_processing.hybrid.hypotheses import (
-    Patch,
-    absorbing,
-    bent,
-    clusters,
-    plate,
-    seeds_by_height,
-    vanished,
-)
-from echolume_processing.hybrid.model import HybridMap, Registration, cell_centres_mm, window_of
+from echolume_processing.hybrid.contradictions import find_plates
+from echolume_processing.hybrid.dark import absorbing
+from echolume_processing.hybrid.grid import OpticalGrid, accumulate
+from echolume_processing.hybrid.heard import Heard, heard
+from echolume_processing.hybrid.model import HybridMap, Registration, window_of
 from echolume_processing.hybrid.registration import register
-from echolume_processing.hybrid.scipy_typed import Mask, NearestPoints
-from echolume_processing.hybrid.sounding import sounding
-from echolume_processing.hybrid.state import State, cells_near, pings_near
-from echolume_processing.hybrid.surface import surface
+from echolume_processing.hybrid.scipy_typed import Mask
+from echolume_processing.hybrid.sounding import Sounding, Spectra, sounding
+from echolume_processing.hybrid.state import State
+from echolume_processing.hybrid.surface import Surface, surface
+from echolume_processing.hybrid.witnesses import Triggers
 from echolume_processing.ping import Ping
 
-ANOMALOUS = 0.25
-"""Residual energy over measured energy above which a ping contradicts the surface."""
-ANOMALOUS_TIMES = 6.0
-"""And it must be so many times that of the better pings, or the model as a whole is at fault."""
-BETTER = 0.5
-"""The better pings are this share of all."""
-NEVER_AGREES = 0.7
-"""A ping of which so much is unexplained contradicts the surface, however bad the others are."""
-PLATES = 12
-"""So many surfaces are sought at most."""
-OFF_SURFACE_MM = 1.5
-"""A contact that lies this near to the surface says nothing new."""
-RIM_MM = 8.0
-"""Pings whose foot is this near to the rim of a plate found hear it and what is beside it."""
-UNEXPLAINED_MM = 5.0
-AGREES_MM = 10.0
-"""A ping confirms what lies this near to its foot."""
 SHARED = 0.05
 """Share of the map that light must have seen to register sound to it."""
 
 
-def fuse(optical: Structured, pings: Sequence[Ping], calibration: Calibration, field: MapField) -> HybridMap:
+@dataclass(frozen=True)
+class Foreseen:
+    """Echoes that were predicted ahead: of which heights, in air of which speed, and their spectra by trigger."""
+
+    height_mm: NDArray[np.float64]
+    speed_mps: float
+    spectra: Mapping[int, NDArray[np.complex64]]
+
+    def of(self, found: Sounding, scene: Surface) -> Mapping[int, NDArray[np.complex64]]:
+        """Those that are still true: of the same surface, in the same air."""
+        same = self.speed_mps == found.speed_mps and np.array_equal(self.height_mm, scene.height_mm)
+        return self.spectra if same else {}
+
+
+def fuse(
+    optical: Structured,
+    pings: Sequence[Ping],
+    calibration: Calibration,
+    field: MapField,
+    triggers: Triggers | None = None,
+) -> HybridMap:
     """Fuse the optical points and the pings of a scan into the hybrid map.
 
     Parameters
@@ -65,11 +63,43 @@ def fuse(optical: Structured, pings: Sequence[Ping], calibration: Calibration, f
         What the scan was made with.
     field
         Cells of the map.
+    triggers
+        Trigger of the stripe that each optical point is of, (n,).
 
     Returns
     -------
     HybridMap
-        Every cell has a label and its provenance; cells without evidence stay unknown, without a height.
+        Every cell has a label and its provenance; cells without evidence stay unknown and have no height.
+    """
+    grid = accumulate(optical, wide_field(field), triggers)
+    if not pings:
+        return explain(grid, None, None, calibration, field)
+    ordered = sorted(pings, key=lambda p: p.trigger)
+    return explain(grid, sounding(ordered, calibration.array), heard(ordered, calibration.array), calibration, field)
+
+
+def explain(
+    grid: OpticalGrid,
+    found: Sounding | None,
+    spoken: Heard | None,
+    calibration: Calibration,
+    field: MapField,
+    foreseen: Foreseen | None = None,
+) -> HybridMap:
+    """The hybrid map from light's cells and the pings in comparable form.
+
+    Parameters
+    ----------
+    grid
+        Light's cells of the `wide_field`.
+    found, spoken
+        The pings, sorted by trigger, and what each of them met; None if there are none.
+    calibration
+        What the scan was made with.
+    field
+        Cells of the map.
+    foreseen
+        Predictions made before, of the same pings; used if they are of the surface that light saw in the end.
 
     Notes
     -----
@@ -78,18 +108,13 @@ def fuse(optical: Structured, pings: Sequence[Ping], calibration: Calibration, f
     explains the pings over them. Pings that still disagree propose the planes that they met; each plane whose extent
     explains their echoes is a plate. What no plate explains is unknown: the cells whose echo is missing.
     """
-    wide = wide_field(field)
-    grid = accumulate(optical, wide)
-    closed = holes.close(grid)
+    wide, closed = grid.field, holes.close(grid)
     cells = Cells(field, grid, closed)
-    if not pings or not np.isfinite(grid.height_mm).any():
-        missing = "no pings" if not pings else "no optical points"
+    if found is None or spoken is None or not np.isfinite(grid.height_mm).any():
+        missing = "no pings" if found is None else "no optical points"
         return cells.finish(Registration(), (f"{missing}: nothing was compared",))
-    ordered = sorted(pings, key=lambda p: p.trigger)
-    found = sounding(ordered, calibration.array)
-    spoken = heard(ordered, calibration.array)
     scene = surface(closed.height_mm, wide)
-    predicted = found.predict(scene, np.arange(len(found.apertures)))
+    predicted = _predicted(found, scene, foreseen)
     shared = float(closed.seen[window_of(wide, field)].mean())
     registration = Registration()
     if shared >= SHARED:
@@ -105,8 +130,17 @@ def fuse(optical: Structured, pings: Sequence[Ping], calibration: Calibration, f
         state = State(found, state.scene, predicted)
         spoken = spoken.raised(again.dz_mm)
         registration = registration.then(again)
-    _find_plates(state, cells, spoken)
-    return cells.finish(registration, (*cells.notes, *registration.notes, *_limits(calibration)))
+    find_plates(state, cells, spoken)
+    by_trigger = np.array(found.triggers, dtype=np.uint32)
+    return cells.finish(registration, (*cells.notes, *registration.notes, *_limits(calibration)), by_trigger)
+
+
+def _predicted(found: Sounding, scene: Surface, foreseen: Foreseen | None) -> Spectra:
+    """Echoes of a surface for all pings; those that were predicted ahead are not predicted again."""
+    ahead = foreseen.of(found, scene) if foreseen is not None else {}
+    missing = [k for k, trigger in enumerate(found.triggers) if trigger not in ahead]
+    anew = dict(zip(missing, found.predict(scene, missing), strict=True)) if missing else {}
+    return np.stack([anew[k] if k in anew else ahead[trigger] for k, trigger in enumerate(found.triggers)])
 
 
 def _fill_holes(state: State, found_holes: Sequence[Mask], cells: Cells, spoken: Heard) -> State:
@@ -114,113 +148,8 @@ def _fill_holes(state: State, found_holes: Sequence[Mask], cells: Cells, spoken:
     for hole in found_holes:
         patch = absorbing(state, hole, spoken)
         if patch is not None:
-            cells.put(patch, state.scene.height_mm)
+            cells.in_holes.append(patch)
             state = state.with_patch(patch.mask, patch.plane)
-    return state
-
-
-def _find_plates(state: State, cells: Cells, spoken: Heard) -> None:
-    """Explain contradicting pings by surfaces, the one that most of them met first; then say what is left."""
-    refused = np.zeros(len(state.found.apertures), dtype=np.bool_)
-    settled = refused.copy()
-    for _ in range(PLATES):
-        odd = _contradicting(state)
-        chosen = _next_plate(state, odd, refused, cells, spoken)
-        if chosen is None:
-            break
-        patch, after = chosen
-        cells.put(patch, state.scene.height_mm)
-        state = after
-        settled[_inside(state, patch)] = True
-    if cells.beside.any():
-        state = _straighten(state, cells, spoken)
-    odd = _contradicting(state)
-    for cluster in clusters(state.found, np.nonzero(odd & ~settled)[0]):
-        state = _unexplained(state, cluster, cells)
-    _judge_dark(state, cells, _contradicting(state))
-
-
-def _straighten(state: State, cells: Cells, spoken: Heard) -> State:
-    """Beside plates, give the ground that light sees bent the height that sound finds."""
-    for seed in seeds(spoken, np.nonzero(_contradicting(state))[0]):
-        chosen = bent(state, seed, cells.beside)
-        if chosen is not None:
-            cells.put(chosen[0], state.scene.height_mm)
-            state = chosen[1]
-    return state
-
-
-def _contradicting(state: State) -> NDArray[np.bool_]:
-    """Pings whose echoes are not those of the surface, (pings,)."""
-    residual = state.residual()
-    limit = max(ANOMALOUS, ANOMALOUS_TIMES * float(np.quantile(residual, BETTER)))
-    return residual > min(limit, NEVER_AGREES)
-
-
-def _next_plate(
-    state: State, odd: NDArray[np.bool_], refused: NDArray[np.bool_], cells: Cells, spoken: Heard
-) -> tuple[Patch, State] | None:
-    """The next surface that explains contradicting pings; those of seeds that do not are marked as refused."""
-    while True:
-        asked = np.nonzero(odd & ~refused & _off_surface(state, spoken))[0]
-        proposals = seeds(spoken, asked) or _by_height(state, np.nonzero(odd & ~refused)[0])
-        if not proposals:
-            return None
-        for seed in proposals:
-            chosen = plate(state, seed, cells.open)
-            if chosen is not None:
-                return chosen
-            refused[seed.which] = True
-
-
-def _by_height(state: State, odd: NDArray[np.int64]) -> list[Seed]:
-    """Seeds where contacts tell no plane, as in a narrow band or with receivers a little off their places."""
-    regions = clusters(state.found, odd)
-    return seeds_by_height(state.found, regions[0]) if regions else []
-
-
-def _off_surface(state: State, spoken: Heard) -> NDArray[np.bool_]:
-    """Pings that met something above the surface, (pings,)."""
-    field, place = state.scene.field, np.nan_to_num(spoken.place_mm, nan=-1e9)
-    rows, columns = field.shape
-    i = np.clip((place[:, 0] - field.x_mm[0]) / field.cell_mm, 0, columns - 1).astype(np.int64)
-    j = np.clip((place[:, 1] - field.y_mm[0]) / field.cell_mm, 0, rows - 1).astype(np.int64)
-    return np.abs(place[:, 2] - state.scene.height_mm[j, i]) > OFF_SURFACE_MM
-
-
-def _inside(state: State, patch: Patch) -> NDArray[np.int64]:
-    """Pings whose foot, or mirror point, lies in a patch or at its rim: they have their explanation."""
-    field = state.scene.field
-    return pings_near(state.found, patch.mask, field, RIM_MM, patch.plane)
-
-
-def _judge_dark(state: State, cells: Cells, odd: NDArray[np.bool_]) -> None:
-    """What light did not see and no surface fills has the height of what is beside it, if the echoes say so."""
-    left = cells.open
-    if not left.any():
-        return
-    foot = state.found.foot_mm
-    x_mm, y_mm = np.meshgrid(*cell_centres_mm(state.scene.field))
-    _, nearest = NearestPoints(foot).nearest(np.column_stack((x_mm[left], y_mm[left])), AGREES_MM)
-    agrees = np.append(~odd, False)[nearest]
-    confirmed = np.zeros(left.shape, dtype=np.bool_)
-    confirmed[left] = agrees
-    cells.confirm(confirmed, state.scene.height_mm, 1)
-    cells.note(cells.open, "a dark region of {cells} cells stays unknown: no echo fits it")
-
-
-def _unexplained(state: State, cluster: NDArray[np.int64], cells: Cells) -> State:
-    """No plate explains these pings: the cells whose echo is missing, or else those right below, are unknown."""
-    foot = state.found.foot_mm[cluster]
-    where = f"around x {foot[:, 0].mean():.0f}, y {foot[:, 1].mean():.0f} mm"
-    missing = vanished(state, cluster)
-    if missing is not None:
-        cells.unknown(
-            missing, f"the echo of {{cells}} cells {where} is missing: something hides them from sound; unknown"
-        )
-        return state.without(missing)
-    mask = cells_near(foot, state.scene.field, UNEXPLAINED_MM)
-    cells.unknown(mask, f"light and sound disagree in {{cells}} cells {where}, and no plate explains it: unknown")
     return state
 
 

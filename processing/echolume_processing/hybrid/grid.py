@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from dataclasses import field as dataclass_field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from echolume_messages.plan import MapField
 from echolume_messages.types import OpticalSource, Provenance, Structured
+from echolume_processing.hybrid.witnesses import Triggers, Witnesses, tabled
 
 STEPS_PER_MM = 1000.0
 """Heights are compared as whole micrometres, so that equal evidence gives equal bits."""
@@ -33,6 +35,8 @@ class OpticalGrid:
     sigma_mm: NDArray[np.float64]
     count: NDArray[np.int64]
     provenance: NDArray[np.uint8]
+    stripes: Witnesses = dataclass_field(default_factory=Witnesses)
+    """Stripes that the points of each cell are of; no table where their triggers were not told."""
 
 
 def cell_index(field: MapField, x_mm: NDArray[np.floating], y_mm: NDArray[np.floating]) -> NDArray[np.int64]:
@@ -44,7 +48,7 @@ def cell_index(field: MapField, x_mm: NDArray[np.floating], y_mm: NDArray[np.flo
     return np.where(inside, iy * columns + ix, -1)
 
 
-def accumulate(points: Structured, field: MapField) -> OpticalGrid:
+def accumulate(points: Structured, field: MapField, triggers: Triggers | None = None) -> OpticalGrid:
     """Median height, spread, count and sources of the optical points in each cell.
 
     Parameters
@@ -53,6 +57,8 @@ def accumulate(points: Structured, field: MapField) -> OpticalGrid:
         ``OPTICAL_POINT`` records (n,) of any number of stripes, in any order.
     field
         The raster of cells.
+    triggers
+        Trigger of the stripe that each point is of, shape (n,).
 
     Returns
     -------
@@ -88,7 +94,12 @@ def accumulate(points: Structured, field: MapField) -> OpticalGrid:
             provenance[cell[used["source"] == source]] |= np.uint8(bit)
     shape = field.shape
     return OpticalGrid(
-        field, height_mm.reshape(shape), sigma_mm.reshape(shape), count.reshape(shape), provenance.reshape(shape)
+        field,
+        height_mm.reshape(shape),
+        sigma_mm.reshape(shape),
+        count.reshape(shape),
+        provenance.reshape(shape),
+        Witnesses() if triggers is None else tabled(cell, triggers[good], rows * columns),
     )
 
 

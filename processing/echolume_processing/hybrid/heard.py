@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from echolume_messages.calibration import ArrayCalibration
-from echolume_messages.types import EchoKind
+from echolume_messages.types import EchoKind, Structured
 from echolume_processing.hybrid.plates import Plane
 from echolume_processing.hybrid.scipy_typed import NearestPoints
 from echolume_processing.ping import Ping
 from echolume_processing.ultrasonic.pipeline import UltrasonicPipeline
 
 LEAST_RECEIVERS = 4
+TOGETHER_MM = 6.0
+"""Paths of one echo to the receivers of an array differ by no more."""
 LEAST_NZ = 0.85
 """Steeper planes send no echo back to where an array over the bench stands."""
 NEIGHBOURS = 1.8
@@ -38,6 +40,9 @@ class Heard:
 
     place_mm: NDArray[np.float64]
     normal: NDArray[np.float64]
+    path_mm: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
+    """Path of the first echo to each receiver, whatever it met; not a number where one heard a later echo, or none
+    (pings, receivers)."""
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -45,8 +50,8 @@ class Heard:
         return np.isfinite(self.place_mm[:, 2])
 
     def raised(self, dz_mm: float) -> Heard:
-        """All contacts higher by `dz_mm`."""
-        return Heard(self.place_mm + np.array([0.0, 0.0, dz_mm]), self.normal)
+        """All contacts higher by `dz_mm`; the paths stay, their array moves."""
+        return replace(self, place_mm=self.place_mm + np.array([0.0, 0.0, dz_mm]))
 
 
 @dataclass(frozen=True)
@@ -68,20 +73,43 @@ class Seed:
 
 
 def heard(pings: Sequence[Ping], calibration: ArrayCalibration) -> Heard:
-    """Contact of each ping: the middle of its receivers' contact points."""
+    """Contact of each ping."""
     pipeline = UltrasonicPipeline(calibration)
-    place_mm, normal = np.full((len(pings), 3), np.nan), np.full((len(pings), 3), np.nan)
-    for k, ping in enumerate(pings):
-        points = pipeline.process(ping)
-        points = points[points["kind"] == EchoKind.PLANE]
-        if points.size < LEAST_RECEIVERS:
-            continue
-        direction = np.array([np.median(points[name].astype(np.float64)) for name in ("nx", "ny", "nz")])
-        direction /= np.linalg.norm(direction)
-        if direction[2] >= LEAST_NZ:
-            place_mm[k] = [np.mean(points[name].astype(np.float64)) for name in ("x_mm", "y_mm", "z_mm")]
-            normal[k] = direction
-    return Heard(place_mm, normal)
+    receivers = len(calibration.receivers_mm)
+    return together([contact(pipeline.process(ping), receivers) for ping in pings])
+
+
+Contact = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+"""Place and unit normal of what one ping met, (3,) each, and its first echo's path to each receiver."""
+
+
+def contact(points: Structured, receivers: int) -> Contact:
+    """Contact of one ping: the middle of its receivers' contact points (``ULTRASONIC_POINT``)."""
+    nothing, path_mm = np.full(3, np.nan), _first_paths_mm(points, receivers)
+    points = points[points["kind"] == EchoKind.PLANE]
+    if points.size < LEAST_RECEIVERS:
+        return nothing, nothing, path_mm
+    normal = np.array([np.median(points[name].astype(np.float64)) for name in ("nx", "ny", "nz")])
+    normal = np.asarray(normal / np.linalg.norm(normal), dtype=np.float64)
+    if normal[2] < LEAST_NZ:
+        return nothing, nothing, path_mm
+    place_mm = [float(np.mean(points[name].astype(np.float64))) for name in ("x_mm", "y_mm", "z_mm")]
+    return np.array(place_mm), normal, path_mm
+
+
+def _first_paths_mm(points: Structured, receivers: int) -> NDArray[np.float64]:
+    """Path to each receiver that heard the first of a ping's echoes; none if it is too few of them."""
+    path_mm = np.full(receivers, np.nan)
+    path_mm[points["receiver"]] = points["path_mm"]
+    with np.errstate(invalid="ignore"):
+        first = path_mm <= np.nanmin(path_mm, initial=np.inf) + TOGETHER_MM
+    return np.where(first & (first.sum() >= LEAST_RECEIVERS), path_mm, np.nan)
+
+
+def together(contacts: Sequence[Contact]) -> Heard:
+    """The contacts of several pings, in their order."""
+    place_mm, normal = (np.array([each[k] for each in contacts]).reshape(-1, 3) for k in range(2))
+    return Heard(place_mm, normal, np.array([each[2] for each in contacts]))
 
 
 def seeds(found: Heard, among: NDArray[np.int64]) -> list[Seed]:

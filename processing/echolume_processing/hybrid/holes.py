@@ -9,15 +9,24 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from echolume_processing.hybrid.grid import OpticalGrid
-from echolume_processing.hybrid.scipy_typed import EIGHT, Mask, NearestPoints, dilated, labelled, opened
+from echolume_processing.hybrid.scipy_typed import EIGHT, Mask, NearestPoints, depth_inside, dilated, labelled, opened
 
 LEAST_POINTS = 2
 LEAST_NEIGHBOURS = 3
 ABSORBING_MM = 9.0
 """A hole that a square of this side fits into is more than a shadow beside a step."""
+PIT_CELLS = 2
+LEVEL_MM = 1.0
+"""A hole that a square of so many cells fits into, with a rim as level as this, has nothing that throws a shadow: it
+may be a dark spot or a pit, and sound does not resolve it."""
+STEEP = 0.7
+"""Beside ground that falls so much towards a hole, more of the same flank may lie in it."""
+WALL_MM = 4.0
+"""A greater difference between neighbouring cells is a wall."""
 BENCH_MM = 0.0
 LOOKED_CELLS = 3.0
-"""The lower ground is sought so much further than twice the distance to the nearest seen cell."""
+"""The lower ground is sought so much further than twice the distance to the nearest seen cell, and than right across
+the hole: a shadow has what throws it on one side, and what it falls on on the other."""
 LOOKED_WIDE_CELLS = 25.0
 """Beside a wide hole, further: light sees the rim of a plate, and nothing of what is next to it."""
 
@@ -59,10 +68,42 @@ def close(grid: OpticalGrid) -> Closed:
     wide = opened(holes, max(1, round(ABSORBING_MM / grid.field.cell_mm)))
     labels, number = labelled(wide)
     absorbing = tuple(np.asarray(labels == k) for k in range(1, number + 1))
-    occluded = holes & ~wide
+    occluded = holes & ~wide & ~_untold(grid, seen, holes & ~wide)
     height_mm = np.where(seen, grid.height_mm, BENCH_MM)
     _fill_from_lower(height_mm, seen, holes, wide)
     return Closed(height_mm, seen, occluded, absorbing, ~swept)
+
+
+def _untold(grid: OpticalGrid, seen: Mask, narrow: Mask) -> Mask:
+    """Small holes of which nothing tells whether they are pits or dark spots, and flanks too steep for light."""
+    labels, _ = labelled(narrow)
+    fall_mm = _fall(np.where(seen, grid.height_mm, np.nan))
+    out = np.zeros_like(narrow)
+    for k in np.unique(labels[opened(narrow, PIT_CELLS)]):
+        j, i = np.nonzero(labels == k)
+        around = (slice(max(0, j.min() - 1), j.max() + 2), slice(max(0, i.min() - 1), i.max() + 2))
+        inside = labels[around] == k
+        rim = dilated(inside) & seen[around]
+        if not rim.any():
+            continue
+        rim_mm = grid.height_mm[around][rim]
+        small = max(np.ptp(j), np.ptp(i)) * grid.field.cell_mm < ABSORBING_MM
+        above = rim_mm > rim_mm.min() + LEVEL_MM
+        if np.median(fall_mm[around][rim][above]) > STEEP * grid.field.cell_mm if above.any() else small:
+            out[around] |= inside
+    return out
+
+
+def _fall(height_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How much each cell lies above or below its known neighbours, in the median, those beyond a wall left out."""
+    rows, columns = height_mm.shape
+    padded = np.pad(height_mm, 1, constant_values=np.nan)
+    beside = [padded[1 + j : 1 + j + rows, 1 + i : 1 + i + columns] for j in (-1, 0, 1) for i in (-1, 0, 1) if i or j]
+    off_mm = np.sort(np.abs(np.stack(beside) - height_mm), axis=0)  # those not known come last
+    off_mm[off_mm > WALL_MM] = np.nan
+    known = np.isfinite(off_mm).sum(axis=0)
+    middle = np.take_along_axis(off_mm, np.maximum(known - 1, 0)[None] // 2, axis=0)[0]
+    return np.where(known > 0, middle, 0.0)
 
 
 def _swept(seen: Mask) -> Mask:
@@ -87,11 +128,12 @@ def _fill_from_lower(height_mm: NDArray[np.float64], seen: Mask, holes: Mask, wi
             continue
         cells, rim_cells = np.argwhere(inside), np.argwhere(rim)
         view, looked = height_mm[around], LOOKED_WIDE_CELLS if wide[around][inside].any() else LOOKED_CELLS
+        across = 2 * float(depth_inside(inside).max()) + LOOKED_CELLS
         rim_mm = view[rim]
         known = NearestPoints(rim_cells.astype(np.float64))
         nearest, _ = known.nearest(cells.astype(np.float64))
         for cell, distance in zip(cells, nearest, strict=True):
-            near = known.around(cell.astype(np.float64), 2 * float(distance) + looked)
+            near = known.around(cell.astype(np.float64), max(2 * float(distance) + looked, across))
             low = near[rim_mm[near] <= rim_mm[near].min() + 1.0]
             away = ((rim_cells[low] - cell) ** 2).sum(axis=1)
             view[cell[0], cell[1]] = rim_mm[low[int(np.argmin(away))]]

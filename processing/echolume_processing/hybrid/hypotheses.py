@@ -1,45 +1,33 @@
-"""Surfaces that only sound knows: absorbing ones that fill optical holes, and plates that light goes through."""
+"""Plates that light goes through: proposed by a plane that pings met, and explained tile by tile."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from echolume_messages.plan import MapField
 from echolume_messages.types import Label
-from echolume_processing.hybrid.heard import Heard, Seed, seeds
+from echolume_processing.hybrid.heard import Seed
+from echolume_processing.hybrid.model import cell_centres_mm
 from echolume_processing.hybrid.outline import straightened
-from echolume_processing.hybrid.plates import Plane, fit_plane, ping_heights
-from echolume_processing.hybrid.scipy_typed import Mask, NearestPoints, depth_inside, distance_to, labelled, opened
-from echolume_processing.hybrid.sounding import Sounding
-from echolume_processing.hybrid.state import State, cells_near, centres_mm, pings_inside, pings_near, residual_of
+from echolume_processing.hybrid.plates import Plane
+from echolume_processing.hybrid.rims import LitRim, lit_rim
+from echolume_processing.hybrid.scipy_typed import Mask, NearestPoints, depth_inside, distance_to, labelled
+from echolume_processing.hybrid.settle import is_narrow, settle
+from echolume_processing.hybrid.state import State, cells_near, pings_inside, pings_near, residual_of
 from echolume_processing.hybrid.tiles import covered, occupancy, tiles_over, without_pinholes
 
-INSIDE_MM = 5.0
-"""A ping counts as over a hole if its foot is this far inside; less in a small one."""
-CANDIDATES = 4
-APART_MM = 3.0
-"""So many heights are tried for a hole, so far apart."""
-EXPLAINED = 0.2
-"""A residual energy below this share of the measured one is an explanation in itself."""
-LEAST_PINGS = 3
-LEAST_OVER_HOLE = 2
 JUDGED_MM = 30.0
 """Pings whose foot or mirror point is this near to a region judge it."""
-JUDGES = 80
-"""So many judges are enough to accept or refuse a surface."""
-STEP_MM = 0.3
-"""Step of the parabola through three heights."""
 ACCEPTED = 0.6
 """A surface must bring the residual energy below this share of what it was."""
 INSIDE_LEFT = 0.45
-"""Over a plate's own cells no more than this of the measured energy may be left over."""
-CLOSE_MM = 2.0
-"""Pings whose own height is this near to a plane may have met it."""
-LEVEL_FIRST = 0.95
-"""A tilted plane must explain so much better than a level one."""
+"""Over a plate's own cells, or where pings met it, no more than this of the measured energy may be left over."""
+OVER_MM = 5.0
+LEAST_TO_TURN = 6
+"""The tilt of a plate is refined by so many pings or more: that met it, or whose mirror points lie so far inside."""
 LEAST_MM2 = 150.0
 LEAST_RISE_MM = 1.5
 NEIGHBOUR_MM = 14.0
@@ -50,24 +38,24 @@ GROWS = 3
 END_MM, LEAST_AT_END_MM2 = 3.0, 40.0
 """A plate of which so much lies so near to the end of what was searched may reach further."""
 SNAP_MM = 4.0
-"""Between the rim of a dark surface as sound sees it and as light does may lie so much."""
-DARK_SHARE = 0.5
-"""A surface that light is missing over so much of is not one that light goes through."""
-KEPT = 0.3
-"""Cells of a hole of which sound finds less than this covered do not belong to the surface in it."""
-SHADOW_MM = 3.0
-"""Narrower strips of such cells are within what sound resolves."""
+"""Between the rim of a surface as sound sees it and as light does may lie so much."""
+INNER_MM = 3.0
+THROUGH = 0.15
+"""Light goes through a plate if it sees something below in so much of what lies deeper inside its outline."""
 RIM_CELLS = 2
 RIM_MM = 6.0
 """The rim of a plate is sought again so far in and out, with tiles of so many cells."""
-VANISHED = 0.8
-"""Missing echoes must bring the residual energy below this share of what it was."""
 STRAIGHT = 1.02
 """An outline with straight sides may leave so much more over."""
-NARROW = 0.3
-"""Below this relative bandwidth a height is only known up to half a wavelength, unless the echoes say more."""
-RIVAL = 1.15
-"""A rival height whose residual is below this times the best one cannot be told from it."""
+
+
+@dataclass(frozen=True)
+class Light:
+    """What light says of each cell."""
+
+    seen: Mask
+    dark: Mask
+    """Where it returned nothing, and nobody knows yet what is there."""
 
 
 @dataclass(frozen=True)
@@ -83,52 +71,20 @@ class Patch:
     label: Label
     """Absorbing: light returned nothing from most of it; transparent: light goes through; matte: light sees it, bent by
     a plate beside it."""
+    which: NDArray[np.int64]
+    """Pings that met it: those that proposed it, and those whose mirror point lies in it."""
+    left: float
+    """Residual energy of the pings that judged it, with it over without it."""
+    rim: Mask | None = None
+    """Cells of which light sees just the plate's rim."""
+    bent: Mask | None = None
+    """Cells of which light sees the ground too high, through the plate."""
+    doubt_mm: NDArray[np.float64] | None = None
+    """One sigma more of each cell, where the surface goes on from where pings met it; image."""
 
 
-def absorbing(state: State, hole: Mask, heard: Heard) -> Patch | None:
-    """The plane that fills an optical hole, or most of it; None if sound finds none."""
-    found, field = state.found, state.scene.field
-    deepest_mm = float(depth_inside(hole).max()) * field.cell_mm
-    over = pings_inside(found, hole, field, min(INSIDE_MM, 0.3 * deepest_mm))
-    if over.size < LEAST_OVER_HOLE:
-        return None
-    judges = over[:: max(1, over.size // JUDGES)]
-    before = residual_of(found, state.predicted[judges], judges)
-    heights = ping_heights(found, judges)
-    middle = found.foot_mm[over].mean(axis=0)
-    level = [Plane(float(middle[0]), float(middle[1]), z) for z in heights.candidates(CANDIDATES, APART_MM)]
-    seen = seeds(heard, over)[:1]
-    planes = [*level, fit_plane(found, heights, True), *(seed.plane for seed in seen)]
-    plane, ambiguous = _settle(state, hole, planes, judges)
-    any_over = pings_inside(found, hole, field, 0.0)
-    near = cells_near(plane.mirror_points(centres_mm(found)[any_over]), field, NEIGHBOUR_MM)
-    mask = _within(state, hole & near, plane)
-    if mask.sum() * field.cell_mm**2 < LEAST_MM2 / 2:
-        return None
-    after = residual_of(found, found.predict(state.scene_with(mask, plane), judges), judges)
-    if after >= max(EXPLAINED, ACCEPTED * before):
-        return None
-    centre = centres_mm(found)[judges]
-    off_mm = heights.height_mm - plane.at(centre[:, 0], centre[:, 1])
-    spread_mm = seen[0].spread_mm if seen else 1.4826 * float(np.median(np.abs(off_mm)))
-    sigma_mm = max(0.05, spread_mm / float(np.sqrt(over.size)))
-    return Patch(mask, plane, sigma_mm, int(over.size), ambiguous, Label.ABSORBING)
-
-
-def _within(state: State, hole: Mask, plane: Plane) -> Mask:
-    """The cells of a hole that a plane fills, by sound: shadows beside what is dark do not belong to it."""
-    field = state.scene.field
-    if not hole.any():
-        return hole
-    judges = pings_near(state.found, hole, field, JUDGED_MM, plane)
-    tiles = tiles_over(distance_to(hole) * field.cell_mm <= SNAP_MM)
-    share = occupancy(state.found, state.scene, state.predicted[judges], judges, plane, tiles).share
-    bare = hole & (tiles.fine(np.where(tiles.grid >= 0, share[tiles.grid], 0.0), hole.shape) < KEPT)
-    return hole & ~opened(bare, max(1, round(SHADOW_MM / field.cell_mm)))
-
-
-def plate(state: State, seed: Seed, dark: Mask) -> tuple[Patch, State] | None:
-    """The surface in the plane of a seed that explains its pings, and the state with it; None if it does not.
+def plate(state: State, seed: Seed, light: Light, also: Mask) -> tuple[Patch, State, State] | None:
+    """The surface in the plane of a seed that explains its pings; None if it does not.
 
     Parameters
     ----------
@@ -136,20 +92,32 @@ def plate(state: State, seed: Seed, dark: Mask) -> tuple[Patch, State] | None:
         What is believed so far; it predicts these pings badly.
     seed
         A plane, the pings that met it and where.
-    dark
-        Where light returned nothing.
+    light
+        Which cells light saw, and which are dark.
+    also
+        Cells where the surface may lie too, though those pings did not meet it there.
+
+    Returns
+    -------
+    tuple of Patch, State, State
+        The surface, what is below it, and the state with it.
     """
     found, field = state.found, state.scene.field
-    mask, judges = _extent(state, seed)
+    mask, judges = _extent(state, seed, also)
+    if seed.plane.bent:  # it ends where it meets the ground
+        mask &= seed.plane.image(field) > state.scene.height_mm + LEAST_RISE_MM
     if mask.sum() * field.cell_mm**2 < LEAST_MM2:
         return None
-    plane, ambiguous = _settle(state, mask, [seed.plane], seed.which)
-    rise_mm = float(np.median((plane.image(field) - state.scene.height_mm)[mask]))
-    if rise_mm < LEAST_RISE_MM:
+    rim = lit_rim(state, mask, seed.plane, light.seen)
+    state = rim.state
+    over = np.union1d(seed.which, pings_inside(found, mask, field, OVER_MM, seed.plane))
+    plane, ambiguous = settle(state, mask, _planes(state, seed), over, turns=over.size >= LEAST_TO_TURN)
+    rise_mm = plane.image(field) - state.scene.height_mm
+    if float(np.median(rise_mm[mask])) < LEAST_RISE_MM:
         return None
-    is_dark = bool((mask & dark).sum() >= DARK_SHARE * mask.sum())
+    is_dark = not _goes_through(mask, light.seen & ~rim.lit & (rise_mm > LEAST_RISE_MM), field.cell_mm)
     if is_dark:
-        mask = dark & (distance_to(mask) * field.cell_mm <= SNAP_MM)
+        mask = light.dark & (distance_to(mask) * field.cell_mm <= SNAP_MM)
     ways = [(hangs, state.with_patch(mask, plane, hangs=hangs)) for hangs in (False, True)]
     before = residual_of(found, state.predicted[judges], judges)
     after = [residual_of(found, believed.predicted[judges], judges) for _, believed in ways]
@@ -157,14 +125,44 @@ def plate(state: State, seed: Seed, dark: Mask) -> tuple[Patch, State] | None:
     if min(after) >= ACCEPTED * before:
         return None
     if not is_dark:
-        mask = _rim(state, believed, mask, plane, judges)
+        mask = _rim(state, believed, mask, plane, judges, rim)
         believed = state.with_patch(mask, plane, hangs=hangs)
         mask, believed = _straight(state, believed, mask, plane, judges)
     inside = pings_inside(found, mask, field, 0.0, plane)
-    if inside.size and residual_of(found, believed.predicted[inside], inside) > INSIDE_LEFT:
+    asked = inside if inside.size else seed.which
+    if residual_of(found, believed.predicted[asked], asked) > INSIDE_LEFT:
         return None
     label = Label.ABSORBING if is_dark else Label.TRANSPARENT
-    return Patch(mask, plane, seed.sigma_mm, int(seed.which.size), ambiguous, label), believed
+    pings, left = int(seed.which.size), residual_of(found, believed.predicted[judges], judges) / before
+    which = np.union1d(seed.which, inside)
+    patch = Patch(mask, plane, seed.sigma_mm, pings, ambiguous, label, which, left, rim.lit, rim.bent)
+    return replace(patch, doubt_mm=_beyond_mm(seed, field)), state, believed
+
+
+def _beyond_mm(seed: Seed, field: MapField) -> NDArray[np.float64] | None:
+    """How far a bent surface may be from where it is said to go on: by what a sphere leaves its paraboloid."""
+    plane = seed.plane
+    if not plane.bent:
+        return None
+    x_mm, y_mm = np.meshgrid(*cell_centres_mm(field))
+    away_mm, _ = NearestPoints(seed.place_mm).nearest(np.column_stack((x_mm.ravel(), y_mm.ravel())))
+    bend = max(abs(plane.bend_xx), abs(plane.bend_yy), abs(plane.bend_xy))
+    return (bend**3 * away_mm**4 / 8).reshape(field.shape)
+
+
+def _planes(state: State, seed: Seed) -> list[Plane]:
+    """The plane of a seed, and the level one through the same contacts: the normals of a few contacts err."""
+    if is_narrow(state.found) or seed.plane.level or seed.plane.bent:
+        return [seed.plane]
+    x, y = seed.place_mm.mean(axis=0)
+    return [seed.plane, Plane(float(x), float(y), float(seed.plane.at(np.array([x]), np.array([y]))[0]))]
+
+
+def _goes_through(mask: Mask, below: Mask, cell_mm: float) -> bool:
+    """Whether light sees through a surface; `below` is where it sees something under the surface's plane."""
+    inner = depth_inside(mask) * cell_mm > INNER_MM
+    where = inner if inner.any() else mask
+    return bool((below & where).sum() >= THROUGH * where.sum())
 
 
 def bent(state: State, seed: Seed, beside: Mask) -> tuple[Patch, State] | None:
@@ -185,16 +183,18 @@ def bent(state: State, seed: Seed, beside: Mask) -> tuple[Patch, State] | None:
     before, after = (residual_of(found, s.predicted[seed.which], seed.which) for s in (state, believed))
     if after >= ACCEPTED * before:
         return None
-    return Patch(mask, seed.plane, seed.sigma_mm, int(seed.which.size), False, Label.MATTE), believed
+    pings = int(seed.which.size)
+    patch = Patch(mask, seed.plane, seed.sigma_mm, pings, False, Label.MATTE, seed.which, after / before)
+    return patch, believed
 
 
-def _extent(state: State, seed: Seed) -> tuple[Mask, NDArray[np.int64]]:
+def _extent(state: State, seed: Seed, also: Mask) -> tuple[Mask, NDArray[np.int64]]:
     """Cells that a plate in the plane of a seed covers, and the pings that judge it.
 
     Sought around where pings met it, and further on as long as it reaches the end of what was searched.
     """
     found, field = state.found, state.scene.field
-    window = cells_near(seed.place_mm, field, NEIGHBOUR_MM)
+    window = cells_near(seed.place_mm, field, NEIGHBOUR_MM) | also
     mask, judges = np.zeros_like(window), seed.which
     for _ in range(GROWS):
         judges = pings_near(found, window, field, JUDGED_MM, seed.plane)
@@ -208,12 +208,28 @@ def _extent(state: State, seed: Seed) -> tuple[Mask, NDArray[np.int64]]:
     return mask, judges
 
 
-def _rim(state: State, believed: State, mask: Mask, plane: Plane, judges: NDArray[np.int64]) -> Mask:
-    """The mask with its rim found again on small tiles, from what the plate so far leaves over."""
+def _rim(state: State, believed: State, mask: Mask, plane: Plane, judges: NDArray[np.int64], rim: LitRim) -> Mask:
+    """The mask with its rim found again on small tiles."""
+    share = rim_shares(state, believed, mask, plane, judges)
+    fine = _largest(without_pinholes(share > rim.share_at(share), state.scene.field.cell_mm))
+    return fine if fine.any() else mask
+
+
+def rim_shares(
+    state: State, believed: State, mask: Mask, plane: Plane | None, judges: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """How much of each cell is covered, near to the rim of a mask: on small tiles, from what the mask leaves over.
+
+    Parameters
+    ----------
+    state, believed
+        What is below, and the state with what covers it within the mask.
+    plane
+        What covers it; None: something without an echo.
+    """
     field = state.scene.field
     depth_mm = np.where(mask, depth_inside(mask), distance_to(mask)) * field.cell_mm
-    band = depth_mm <= RIM_MM
-    tiles = tiles_over(band, RIM_CELLS)
+    tiles = tiles_over(depth_mm <= RIM_MM, RIM_CELLS)
     start = tiles.mean(mask)
     at = tiles.grid >= 0
     already = np.zeros(tiles.corners.shape[0])
@@ -221,8 +237,7 @@ def _rim(state: State, believed: State, mask: Mask, plane: Plane, judges: NDArra
     share = occupancy(state.found, state.scene, believed.predicted[judges], judges, plane, tiles, already).share
     coarse = start.copy()
     coarse[at] = share[tiles.grid[at]]
-    fine = _largest(without_pinholes(tiles.fine(coarse, mask.shape) > 0.5, field.cell_mm))
-    return fine if fine.any() else mask
+    return tiles.fine(coarse, mask.shape)
 
 
 def _straight(state: State, believed: State, mask: Mask, plane: Plane, judges: NDArray[np.int64]) -> tuple[Mask, State]:
@@ -236,59 +251,6 @@ def _straight(state: State, believed: State, mask: Mask, plane: Plane, judges: N
     return (straight, other) if after <= STRAIGHT * before else (mask, believed)
 
 
-def seeds_by_height(found: Sounding, cluster: NDArray[np.int64]) -> list[Seed]:
-    """A level and a tilted plane through the heights of some pings, for echoes from which no contact can be told."""
-    heights = ping_heights(found, cluster)
-    centre, out = centres_mm(found)[cluster], list[Seed]()
-    for tilted in (False, True):
-        plane = fit_plane(found, heights, tilted)
-        if tilted and plane.slope_x == plane.slope_y == 0.0:
-            continue
-        off_mm = np.abs(heights.height_mm - plane.at(centre[:, 0], centre[:, 1]))
-        close = off_mm <= CLOSE_MM
-        if close.sum() >= LEAST_PINGS:
-            spread_mm = 1.4826 * float(np.median(off_mm[close]))
-            out.append(Seed(plane, cluster[close], found.foot_mm[cluster], spread_mm))
-    return out
-
-
-def vanished(state: State, cluster: NDArray[np.int64]) -> Mask | None:
-    """Where the echo of the surface is missing and nothing came back instead; None if that explains nothing.
-
-    Notes
-    -----
-    A smooth plate that throws sound elsewhere hides what lies below it without an echo of its own.
-    """
-    found, field = state.found, state.scene.field
-    window = cells_near(found.foot_mm[cluster], field, NEIGHBOUR_MM)
-    judges = pings_near(found, window, field, JUDGED_MM)
-    tiles = tiles_over(window)
-    missing = occupancy(found, state.scene, state.predicted[judges], judges, None, tiles)
-    if missing.explained >= VANISHED:
-        return None
-    mask = covered(missing.share, tiles, window.shape, field.cell_mm)
-    return mask if mask.any() else None
-
-
-def clusters(found: Sounding, anomalous: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Groups of neighbouring anomalous pings, each sorted; neighbours are up to 1.6 times the scan's pitch apart."""
-    if anomalous.size < LEAST_PINGS:
-        return []
-    foot = found.foot_mm
-    pairs = NearestPoints(foot[anomalous]).pairs(1.6 * NearestPoints(foot).spacing())
-    group = np.arange(anomalous.size)
-    for _ in range(anomalous.size):
-        low = np.minimum(group[pairs[:, 0]], group[pairs[:, 1]])
-        new = group.copy()
-        np.minimum.at(new, pairs[:, 0], low)
-        np.minimum.at(new, pairs[:, 1], low)
-        if np.array_equal(new, group):
-            break
-        group = new
-    found_groups = [anomalous[group == g] for g in np.unique(group)]
-    return sorted((g for g in found_groups if g.size >= LEAST_PINGS), key=lambda g: (-g.size, int(g[0])))
-
-
 def _largest(mask: Mask) -> Mask:
     """The largest connected piece."""
     labels, number = labelled(mask)
@@ -297,46 +259,3 @@ def _largest(mask: Mask) -> Mask:
     sizes = np.bincount(labels.ravel())
     sizes[0] = 0
     return labels == int(sizes.argmax())
-
-
-def is_narrow(found: Sounding) -> bool:
-    """Whether the band is too narrow for one height to be told from the next."""
-    return found.band.high_hz - found.band.low_hz < NARROW * found.band.low_hz
-
-
-def _settle(state: State, mask: Mask, planes: list[Plane], over: NDArray[np.int64]) -> tuple[Plane, bool]:
-    """Choose a plane and refine its height on the pings right over it; and whether another height is as good."""
-    judges = over[:: max(1, over.size // 16)]
-    near = state.scene_with(mask, planes[0])
-
-    def cost(plane: Plane) -> float:
-        return residual_of(state.found, state.found.predict(state.scene_with(mask, plane, near), judges), judges)
-
-    costs = [cost(p) * (1.0 if p.slope_x == p.slope_y == 0.0 else 1 / LEVEL_FIRST) for p in planes]
-    best = int(np.argmin(costs))
-    plane, level = planes[best], costs[best]
-    half_wave_mm = 1e3 * state.found.speed_mps / (state.found.band.low_hz + state.found.band.high_hz)
-    narrow = is_narrow(state.found)
-    if narrow:
-        plane, level = _slip(plane, level, half_wave_mm, cost)
-    plane, level = _parabola(plane, cost)
-    rivals = [cost(plane.raised(s * half_wave_mm)) for s in (-1, 1)] if narrow else []
-    return plane, any(r < RIVAL * level for r in rivals)
-
-
-def _slip(plane: Plane, level: float, half_wave_mm: float, cost: Callable[[Plane], float]) -> tuple[Plane, float]:
-    """The best of the heights that differ by whole half wavelengths."""
-    rivals = [plane.raised(n * half_wave_mm) for n in (-3, -2, -1, 1, 2, 3)]
-    costs = [cost(r) for r in rivals]
-    k = int(np.argmin(costs))
-    return (rivals[k], costs[k]) if costs[k] < level else (plane, level)
-
-
-def _parabola(plane: Plane, cost: Callable[[Plane], float]) -> tuple[Plane, float]:
-    """Refine a height by the parabola through three residuals, at most `STEP_MM` away."""
-    below, level, above = (cost(plane.raised(step)) for step in (-STEP_MM, 0.0, STEP_MM))
-    bend = below - 2 * level + above
-    if bend <= 0:
-        return plane, level
-    shift_mm = float(np.clip(0.5 * (below - above) / bend, -1.0, 1.0)) * STEP_MM
-    return plane.raised(shift_mm), level - 0.125 * (below - above) ** 2 / bend

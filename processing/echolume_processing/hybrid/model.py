@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echolume_messages.plan import MapField
-from echolume_messages.types import MAP_CELL, Label, Provenance, Structured
+from echolume_messages.types import MAP_CELL, NO_TRIGGER, Label, Provenance, Structured
+from echolume_processing.hybrid.witnesses import Witnesses
 
 MOVES = (
     "dz_mm",
@@ -100,6 +101,10 @@ class HybridMap:
     cells: Structured
     registration: Registration
     notes: tuple[str, ...] = ()
+    stripes: Witnesses = dataclasses.field(default_factory=Witnesses)
+    """Stripes that put points into each cell, by trigger."""
+    pings: Witnesses = dataclasses.field(default_factory=Witnesses)
+    """Pings whose echo explains each cell, by trigger; see `accounts`."""
 
     def image(self, name: str) -> NDArray[Any]:
         """One field of the cells as an image, shape (rows along y, columns along x)."""
@@ -114,6 +119,8 @@ def empty_cells(field: MapField) -> Structured:
     cells["ix"], cells["iy"] = ix, iy
     cells["front_mm"] = cells["behind_mm"] = cells["sigma_mm"] = np.nan
     cells["label"], cells["provenance"] = Label.UNKNOWN, Provenance.NONE
+    for name in ("stripe_first", "stripe_last", "ping"):
+        cells[name] = NO_TRIGGER
     return cells
 
 

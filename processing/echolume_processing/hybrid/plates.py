@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,42 +10,91 @@ from numpy.typing import NDArray
 from echolume_messages.plan import MapField
 from echolume_processing.hybrid.model import cell_centres_mm
 from echolume_processing.hybrid.predict import Aperture
-from echolume_processing.hybrid.sounding import CEILING_MM, Sounding
+from echolume_processing.hybrid.sounding import CEILING_MM, Sounding, Spectra
 
 HEIGHT_STEP_MM = 0.25
 LOWEST_MM = -5.0
 FIT_ROUNDS = 20
+NEAREST_ROUNDS = 12
+LEAST_SIZE = 0.1
+"""Newton's determinant is taken to be no smaller: a hollow surface may have no nearest point."""
 STEEPEST = 0.4
 """No plate is sought beyond this slope: its echo would miss the array everywhere."""
 
 
 @dataclass(frozen=True)
 class Plane:
-    """z = z_mm + slope_x (x - x_mm) + slope_y (y - y_mm)."""
+    """A plane, or what is bent from one: with dx = x - x_mm and dy = y - y_mm,
+    z = z_mm + slope_x dx + slope_y dy + (bend_xx dx^2 + bend_yy dy^2) / 2 + bend_xy dx dy."""
 
     x_mm: float
     y_mm: float
     z_mm: float
     slope_x: float = 0.0
     slope_y: float = 0.0
+    bend_xx: float = 0.0
+    bend_xy: float = 0.0
+    bend_yy: float = 0.0
+    """Second derivatives, 1/mm."""
+
+    @property
+    def bent(self) -> bool:
+        """Whether it is no plane."""
+        return (self.bend_xx, self.bend_xy, self.bend_yy) != (0.0, 0.0, 0.0)
+
+    @property
+    def level(self) -> bool:
+        """Whether it is a level plane."""
+        return self.slope_x == self.slope_y == 0.0 and not self.bent
 
     def at(self, x_mm: NDArray[np.float64], y_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Height at points."""
-        return self.z_mm + self.slope_x * (x_mm - self.x_mm) + self.slope_y * (y_mm - self.y_mm)
+        dx, dy = x_mm - self.x_mm, y_mm - self.y_mm
+        height_mm = self.z_mm + self.slope_x * dx + self.slope_y * dy
+        if self.bent:
+            height_mm += 0.5 * (self.bend_xx * dx**2 + self.bend_yy * dy**2) + self.bend_xy * dx * dy
+        return height_mm
+
+    def slope_at(
+        self, x_mm: NDArray[np.float64], y_mm: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """dz/dx and dz/dy at points."""
+        dx, dy = x_mm - self.x_mm, y_mm - self.y_mm
+        along_x = self.slope_x + self.bend_xx * dx + self.bend_xy * dy
+        return along_x, self.slope_y + self.bend_xy * dx + self.bend_yy * dy
 
     def image(self, field: MapField) -> NDArray[np.float64]:
         """Height at each cell of a field."""
         return self.at(*np.meshgrid(*cell_centres_mm(field)))
 
+    def slopes(self, field: MapField) -> NDArray[np.float64]:
+        """dz/dx and dz/dy at each cell of a field, shape (rows, columns, 2)."""
+        return np.stack(self.slope_at(*np.meshgrid(*cell_centres_mm(field))), axis=2)
+
     def mirror_points(self, centre_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """x and y of the foot of the perpendicular from each point (n, 3) on the plane, shape (n, 2)."""
+        """x and y of the foot of the perpendicular from each point (n, 3), shape (n, 2)."""
+        if self.bent:
+            return self._nearest(centre_mm)
         slope = np.array([self.slope_x, self.slope_y])
         above = (centre_mm[:, 2] - self.at(centre_mm[:, 0], centre_mm[:, 1])) / (1 + slope @ slope)
         return centre_mm[:, :2] + above[:, None] * slope
 
+    def _nearest(self, centre_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Newton's way to where the line to each point stands upright on the surface."""
+        x, y = centre_mm[:, 0].copy(), centre_mm[:, 1].copy()
+        for _ in range(NEAREST_ROUNDS):
+            below = self.at(x, y) - centre_mm[:, 2]
+            sx, sy = self.slope_at(x, y)
+            gx, gy = x - centre_mm[:, 0] + below * sx, y - centre_mm[:, 1] + below * sy
+            xx, yy = 1 + sx * sx + below * self.bend_xx, 1 + sy * sy + below * self.bend_yy
+            xy = sx * sy + below * self.bend_xy
+            size = np.maximum(xx * yy - xy * xy, LEAST_SIZE)
+            x, y = x - (yy * gx - xy * gy) / size, y - (xx * gy - xy * gx) / size
+        return np.column_stack((x, y))
+
     def raised(self, dz_mm: float) -> Plane:
-        """The parallel plane, higher by `dz_mm`."""
-        return Plane(self.x_mm, self.y_mm, self.z_mm + dz_mm, self.slope_x, self.slope_y)
+        """The same, higher by `dz_mm`."""
+        return replace(self, z_mm=self.z_mm + dz_mm)
 
 
 @dataclass(frozen=True)
@@ -78,8 +127,13 @@ def tried_heights_mm() -> NDArray[np.float64]:
     return np.arange(LOWEST_MM, CEILING_MM, HEIGHT_STEP_MM)
 
 
-def ping_heights(found: Sounding, which: NDArray[np.int64]) -> PingHeights:
+def ping_heights(found: Sounding, which: NDArray[np.int64], predicted: Spectra | None = None) -> PingHeights:
     """Correlate pings with the image-source echo of a horizontal plate at every height.
+
+    Parameters
+    ----------
+    predicted
+        Echoes of these pings that are explained already: what they leave over is correlated; None: all of the echo.
 
     Notes
     -----
@@ -88,7 +142,8 @@ def ping_heights(found: Sounding, which: NDArray[np.int64]) -> PingHeights:
     """
     heights_mm = tried_heights_mm()
     stacked = np.zeros(heights_mm.size)
-    measured = found.gate.spectrum(found.measured[which])[..., :: found.gate.thinning]
+    waveform = found.measured[which] if predicted is None else found.measured[which] - found.gate.waveform(predicted)
+    measured = found.gate.spectrum(waveform)[..., :: found.gate.thinning]
     best_mm, like = np.empty(which.size), np.empty(which.size)
     for n, k in enumerate(which):
         plates = _plate_spectra(found, found.apertures[int(k)], heights_mm)

@@ -12,7 +12,19 @@ from echolume_messages.errors import ConfigError
 from echolume_messages.files import replacing
 from echolume_messages.types import Label, Structured
 from echolume_processing.hybrid.model import HybridMap, cell_centres_mm
-from echolume_processing.hybrid.stored import RECORD, About, StoredMap, blocks, put_back, unmeasured, with_height
+from echolume_processing.hybrid.stored import (
+    RECORD,
+    About,
+    StoredMap,
+    blocks,
+    lines_of,
+    put_back,
+    require_names,
+    table_of,
+    unmeasured,
+    with_height,
+)
+from echolume_processing.hybrid.witnesses import PAIR, Witnesses
 
 KEPT = [(name, RECORD[name].str) for name in RECORD.names or () if name != "front_mm"]
 """Fields of a cell that are properties of its vertex; its height is the vertex's z."""
@@ -47,7 +59,7 @@ def write(found: HybridMap, path: Path, scan: str = "", calibration: str = "") -
     Notes
     -----
     Coordinates are mm in the rig frame. Cells without a height are no points; those that say anything are the
-    element ``unmeasured``, which other readers pass over.
+    element ``unmeasured``, the triggers that cells rest on are ``stripes`` and ``pings``: other readers pass over them.
     """
     return write_cloud(StoredMap(found, scan, calibration), path)
 
@@ -64,11 +76,19 @@ def write_cloud(stored: StoredMap, path: Path) -> int:
     points, silent = with_height(found), unmeasured(found)
     count = int(points.sum())
     with replacing(path) as fresh, fresh.open("wb") as sink:
-        sink.write(header(stored, [("vertex", count, VERTEX), ("unmeasured", silent.size, np.dtype(KEPT))]))
+        elements = [("vertex", count, VERTEX), ("unmeasured", silent.size, np.dtype(KEPT)), *tables(found)]
+        sink.write(header(stored, elements))
         for cells in blocks(found, points):
             sink.write(vertices(found, cells).tobytes())
         sink.write(kept(silent).tobytes())
+        for lines in lines_of(found).values():
+            sink.write(lines.tobytes())
     return count
+
+
+def tables(found: HybridMap) -> list[tuple[str, int, np.dtype[np.void]]]:
+    """The elements that say which triggers cells rest on."""
+    return [(name, lines.size, PAIR) for name, lines in lines_of(found).items()]
 
 
 def vertices(found: HybridMap, cells: Structured) -> Structured:
@@ -143,21 +163,30 @@ def read(path: Path) -> StoredMap:
         raise ConfigError(f"{path}: has no vertices; expected a PLY file of a map")
     vertex = found["vertex"]
     fronts = vertex[vertex["layer"] == 0] if "layer" in (vertex.dtype.names or ()) else vertex
-    parts = [_records(fronts, path)]
+    parts = [_records(fronts, about, path)]
     if "unmeasured" in found:
-        parts.append(_records(found["unmeasured"], path))
-    return about.stored(put_back(about, parts, path), path)
+        parts.append(_records(found["unmeasured"], about, path))
+    stripes, pings = (_table(found, name, about, path) for name in ("stripes", "pings"))
+    return about.stored(put_back(about, parts, path), path, stripes=stripes, pings=pings)
 
 
-def _records(read: Structured, path: Path) -> Structured:
+def _table(found: dict[str, Structured], name: str, about: About, path: Path) -> Witnesses:
+    if name not in found:
+        return Witnesses()
+    lines = found[name]
+    if lines.dtype != PAIR:
+        raise ConfigError(f"{path}: {name}: expected lines of cell and trigger, got {lines.dtype.names}")
+    return table_of(lines, about.field, path)
+
+
+def _records(read: Structured, about: About, path: Path) -> Structured:
     """Records of cells from vertices, or from cells without a height."""
     there = read.dtype.names or ()
-    missing = [name for name, _ in KEPT if name not in there]
-    if missing:
-        raise ConfigError(f"{path}: lacks {', '.join(missing)}; expected every field of a map's cells")
+    require_names(("front_mm", *there), about, path)
     cells = np.zeros(read.size, dtype=RECORD)
-    for name, _ in KEPT:
-        cells[name] = read[name]
+    for name in about.names:
+        if name != "front_mm":
+            cells[name] = read[name]
     cells["front_mm"] = read["z"] if "z" in there else np.nan
     return cells
 

@@ -18,6 +18,8 @@ from echolume_processing.hybrid.model import HybridMap, cell_centres_mm
 from echolume_processing.hybrid.ply import LABEL_RGB
 
 APPLICATION = "echolume"
+WHITE = 255
+"""Gray of a label that is certainly right; black: unknown, or nobody said."""
 LABELS = tuple(Label)
 
 _GUIDE = """
@@ -25,7 +27,9 @@ _GUIDE = """
 
 | entity | what |
 |---|---|
-| `rig/map/hybrid` | the map, coloured by label; each cell carries its sigma, provenance and counts |
+| `rig/map/hybrid` | the map, coloured by label; each cell carries its sigma, provenance, counts, label's probability, \
+first and last stripe and nearest ping (triggers, `scan_step`; 4294967295: none) |
+| `map/probability` | how probable each label is; black: 0, white: 1 |
 | `rig/map/st`, `at_left`, `at_right` | points of each stripe: stereo yellow, active left green, active right pink |
 | `rig/map/us`, `us_normals` | contact points of each ping; blue: the echoes fit a plane, orange: a point |
 | `rig/cam_left`, `rig/cam_right` | cameras; raw frames of a few triggers, and the peaks that were believed |
@@ -92,6 +96,10 @@ def _log_map(recording: rr.RecordingStream, found: HybridMap) -> None:
             provenance=cells["provenance"],
             optical_n=cells["optical_n"],
             ultrasonic_n=cells["ultrasonic_n"],
+            probability=cells["probability"],
+            stripe_first=cells["stripe_first"],
+            stripe_last=cells["stripe_last"],
+            ping=cells["ping"],
         ),
         static=True,
     )
@@ -100,6 +108,8 @@ def _log_map(recording: rr.RecordingStream, found: HybridMap) -> None:
     recording.log("rig/map/behind", rr.Points3D(below, colors=[(160, 200, 235)], radii=[0.3]), static=True)
     recording.log("map/height", rr.DepthImage(_upright(found.image("front_mm")), meter=1000.0), static=True)
     recording.log("map/labels", rr.SegmentationImage(_upright(found.image("label"))), static=True)
+    gray = np.round(WHITE * np.nan_to_num(found.image("probability"), nan=0.0)).astype(np.uint8)
+    recording.log("map/probability", rr.Image(_upright(gray), color_model="L"), static=True)
 
 
 def _upright(image: NDArray[Any]) -> NDArray[Any]:

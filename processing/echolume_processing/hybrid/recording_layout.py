@@ -36,6 +36,7 @@ def blueprint() -> rrb.Blueprint:
                     rrb.Tabs(
                         rrb.Spatial2DView(origin="/map/labels", name="labels"),
                         rrb.Spatial2DView(origin="/map/height", name="heights"),
+                        rrb.Spatial2DView(origin="/map/probability", name="probability"),
                         rrb.TensorView(origin="/us/echoes", name="raw echoes"),
                     ),
                     rrb.Tabs(

@@ -83,7 +83,7 @@ def register(
     problem = _Problem(found, predicted)
     value, agree = problem.first_look()
     if (reason := _too_few(agree)) is not None:
-        return found, predicted, Registration(0.0, found.speed_mps, refused=reason)
+        return found, predicted, Registration(0.0, found.air_mps, refused=reason)
     before = problem.residual(np.zeros(len(NAMES)))
     view = problem.view(agree, scene)
     value, sigma, determined = problem.solve(view, value)
@@ -92,7 +92,7 @@ def register(
         value, sigma, determined = problem.solve(view, value)
     residual = problem.residual(value)
     if (reason := _too_few(residual < ALIKE) or _too_far(value, found.prior)) is not None:
-        return found, predicted, Registration(0.0, found.speed_mps, refused=reason)
+        return found, predicted, Registration(0.0, found.air_mps, refused=reason)
     settled, corrected, good = problem.settled(value, np.where(determined, sigma, found.prior))
     after = settled.residual(corrected[good], good)
     told = np.append(value[:SPEED], value[SPEED:] * found.speed_mps * np.array([1.0, 2.0]))
@@ -102,7 +102,7 @@ def register(
         corrected,
         Registration(
             **dict(zip(MOVES, told.tolist(), strict=True)),
-            speed_of_sound_mps=found.speed_mps * (1 + float(value[SPEED])),
+            speed_of_sound_mps=found.air_mps * (1 + float(value[SPEED])),
             pings=int((residual < ALIKE).sum()),
             residual_db=_db(after),
             before_db=_db(before[good]),

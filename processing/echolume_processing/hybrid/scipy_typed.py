@@ -7,7 +7,7 @@ from typing import cast
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
-from scipy import ndimage, spatial
+from scipy import ndimage, spatial, special
 
 Mask = NDArray[np.bool_]
 EIGHT = np.ones((3, 3), dtype=np.bool_)
@@ -78,6 +78,11 @@ def interpolated(
     return np.asarray(ndimage.map_coordinates(image, at, order=1), dtype=np.float64)
 
 
+def normal_tail(sigmas: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Share of a normal distribution beyond so many standard deviations; 0 at infinity."""
+    return np.asarray(special.ndtr(-sigmas), dtype=np.float64)
+
+
 class NearestPoints:
     """Points (n, 2) that can be asked which of them is near."""
 
@@ -91,6 +96,11 @@ class NearestPoints:
         """Distance and index of the nearest point of each place (m, 2); infinite and n if none is within."""
         distance, index = self._tree.query(where, distance_upper_bound=within)
         return np.asarray(distance, dtype=np.float64), np.asarray(index, dtype=np.int64)
+
+    def some(self, where: NDArray[np.float64], number: int, within: float) -> NDArray[np.int64]:
+        """Indices (m, number) of the points nearest to each place (m, 2); n where fewer are within."""
+        _, index = self._tree.query(where, k=number, distance_upper_bound=within)
+        return np.asarray(index, dtype=np.int64).reshape(len(where), number)
 
     def around(self, place: NDArray[np.float64], radius: float) -> NDArray[np.int64]:
         """Indices of the points within a radius of one place (2,), sorted."""

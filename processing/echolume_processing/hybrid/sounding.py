@@ -5,14 +5,15 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from echolume_messages.calibration import ArrayCalibration
 from echolume_processing.hybrid.alignment import at_assumed_speed
-from echolume_processing.hybrid.channel import Channels, Gate, band_of, channels, gate, speed_of_sound
+from echolume_processing.hybrid.channel import Channels, Gate, gate, speed_of_sound
+from echolume_processing.hybrid.listening import Listening, kind_of
 from echolume_processing.hybrid.predict import Aperture, Band, Predictor, aperture
 from echolume_processing.hybrid.setup_error import prior_sigma
 from echolume_processing.hybrid.surface import Surface
@@ -42,6 +43,10 @@ class Sounding:
     gate: Gate
     speed_mps: float
     """At which the predictions are made, and to which the measured echoes are brought."""
+    air_mps: float
+    """In the middle of the scan, by the thermometer."""
+    triggers: tuple[int, ...]
+    """Of each ping, sorted."""
     apertures: tuple[Aperture, ...]
     measured: Waveforms
     """Gated waveforms of every ping, per receiver, the channels' delays removed."""
@@ -74,37 +79,64 @@ class Sounding:
         return (np.abs(difference) ** 2).sum(axis=(1, 2)) / self.energy[which]
 
 
-def sounding(pings: Sequence[Ping], calibration: ArrayCalibration) -> Sounding:
+def sounding(
+    pings: Sequence[Ping],
+    calibration: ArrayCalibration,
+    listening: Listening | None = None,
+    spectra: Sequence[NDArray[np.complex64]] | None = None,
+) -> Sounding:
     """Bring pings of one digitiser setting, sorted by trigger, into comparable form.
+
+    Parameters
+    ----------
+    pings
+        All of a scan.
+    calibration
+        What they were made with.
+    listening, spectra
+        What `listening_to` returns for them, and its `measured` of each ping, where that is known already.
 
     Raises
     ------
     ValueError
         If there is no ping, or the pings differ in length or sample rate.
     """
-    kinds = {(p.echoes.shape, p.sample_rate_hz) for p in pings}
-    if len(kinds) != 1:
-        raise ValueError(f"pings: expected one length and sample rate, got {sorted(kinds)}")
-    band = band_of(calibration, pings[0])
+    ears = listening or listening_to(pings, calibration)
+    if spectra is None:
+        spectra = [ears.measured(p) for p in pings]
     order = _order(pings)
-    speed_mps, faster = _speeds(pings, order, calibration)
-    predictor = Predictor(calibration.radius_mm, speed_mps, band)
-    raw = channels(calibration, band)
-    early = np.exp(2j * np.pi * band.frequency_hz * np.array(calibration.delays_s)[:, None]).astype(np.complex64)
-    response = replace(raw, response=raw.response * early)
+    air_mps, faster = _speeds(pings, order, calibration, ears.speed_mps)
     apertures = tuple(aperture(calibration, p.robot_pose) for p in pings)
     z_mm = np.array([a.elements_mm[:, 2] for a in apertures])
     window = gate(
-        band,
-        2 * max(float(z_mm.min()) - CEILING_MM, 0.3 * float(z_mm.min())) / (speed_mps * 1e3),
-        2 * (float(z_mm.max()) - FLOOR_MM) / (speed_mps * 1e3) + _pulse_s(calibration),
+        ears.band,
+        2 * max(float(z_mm.min()) - CEILING_MM, 0.3 * float(z_mm.min())) / (ears.speed_mps * 1e3),
+        2 * (float(z_mm.max()) - FLOOR_MM) / (ears.speed_mps * 1e3) + _pulse_s(calibration),
     )
-    measured = np.stack([window.waveform(response.measured(p) * early) for p in pings])
-    measured = at_assumed_speed(window, response.response * response.filter, measured, faster)
+    measured = np.stack([window.waveform(spectrum) for spectrum in spectra])
+    measured = at_assumed_speed(window, ears.channels.response * ears.channels.filter, measured, faster)
     energy = (np.abs(measured).astype(np.float64) ** 2).sum(axis=(1, 2))
     middle = np.mean([p.robot_pose for p in pings], axis=0)
-    prior = prior_sigma(array_pose_covariance(calibration, middle), 0.5 * float(np.ptp(faster)) * speed_mps, speed_mps)
-    return Sounding(band, predictor, response, window, speed_mps, apertures, measured, energy, order, prior)
+    drift_mps = 0.5 * float(np.ptp(faster)) * ears.speed_mps
+    prior = prior_sigma(array_pose_covariance(calibration, middle), drift_mps, ears.speed_mps)
+    return Sounding(
+        ears.band, ears.predictor, ears.channels, window, ears.speed_mps, air_mps, tuple(p.trigger for p in pings),
+        apertures, measured, energy, order, prior,
+    )  # fmt: skip
+
+
+def listening_to(pings: Sequence[Ping], calibration: ArrayCalibration) -> Listening:
+    """What some pings are compared with: their setting, and air of the median of what they read, whole degrees.
+
+    Raises
+    ------
+    ValueError
+        If there is no ping, or the pings differ in length or sample rate.
+    """
+    kinds = {kind_of(p) for p in pings}
+    if len(kinds) != 1:
+        raise ValueError(f"pings: expected one length and sample rate, got {sorted(kinds)}")
+    return Listening.to(pings[0], calibration, float(np.median([p.air_temperature_c for p in pings])))
 
 
 def _order(pings: Sequence[Ping]) -> NDArray[np.float64]:
@@ -115,9 +147,9 @@ def _order(pings: Sequence[Ping]) -> NDArray[np.float64]:
 
 
 def _speeds(
-    pings: Sequence[Ping], order: NDArray[np.float64], calibration: ArrayCalibration
+    pings: Sequence[Ping], order: NDArray[np.float64], calibration: ArrayCalibration, assumed_mps: float
 ) -> tuple[float, NDArray[np.float64]]:
-    """Speed of sound in the middle of the scan (m/s), and by what share it was faster in each ping.
+    """Speed of sound in the middle of the scan (m/s), and by what share it was faster than assumed in each ping.
 
     A line through the thermometer's readings: one of them is no better than some hundredths of a kelvin.
     """
@@ -125,10 +157,9 @@ def _speeds(
     slope_c = 0.0
     if len(pings) >= LEAST_FOR_A_LINE and (order**2).sum() > 0:
         slope_c = float(((read_c - read_c.mean()) * order).sum() / ((order - order.mean()) ** 2).sum())
-    speed_mps = speed_of_sound(calibration, float(np.median(read_c - slope_c * order)))
-    each_c = np.median(read_c - slope_c * order) + slope_c * order
-    each_mps = np.array([speed_of_sound(calibration, float(c)) for c in each_c])
-    return speed_mps, each_mps / speed_mps - 1
+    middle_c = float(np.median(read_c - slope_c * order))
+    each_mps = np.array([speed_of_sound(calibration, middle_c + slope_c * float(o)) for o in order])
+    return speed_of_sound(calibration, middle_c), each_mps / assumed_mps - 1
 
 
 def _pulse_s(calibration: ArrayCalibration) -> float:

@@ -41,6 +41,11 @@ class State:
         scene = self.scene_with(mask, plane, hangs=hangs)
         return self._predicted_anew(scene, pings_near(self.found, mask, scene.field, NOTICED_MM, plane))
 
+    def with_heights(self, height_mm: NDArray[np.float64], changed: Mask) -> State:
+        """The state with other heights in some cells."""
+        scene = reshaped(self.scene, height_mm)
+        return self._predicted_anew(scene, pings_near(self.found, changed, scene.field, NOTICED_MM))
+
     def without(self, mask: Mask) -> State:
         """The state with cells that sound does not reach."""
         scene = without_echo(self.scene, mask)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Generator
+from collections.abc import Collection, Generator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,10 +18,13 @@ from echolume_messages.plan import MapField
 from echolume_messages.types import MAP_CELL, Label, Provenance, Structured
 from echolume_processing.hybrid.digest import digest
 from echolume_processing.hybrid.model import HybridMap, Registration, empty_cells
+from echolume_processing.hybrid.witnesses import Witnesses, tabled
 
 log = logging.getLogger("echolume.export")
 
-FORMAT = 1
+FORMAT = 2
+ADDED = {2: ("probability", "stripe_first", "stripe_last", "ping")}
+"""Fields of a cell that a format has, and those before it have not."""
 BLOCK = 1 << 18
 """Cells that are held as records of a file at a time."""
 RECORD = np.dtype([(name, MAP_CELL[name].str) for name in MAP_CELL.names or ()])
@@ -86,17 +89,62 @@ class About(msgspec.Struct, frozen=True, kw_only=True):
             about = msgspec.convert(json.loads(text), cls)
         except (ValueError, msgspec.ValidationError) as error:
             raise ConfigError(f"{path}: what it says about its map cannot be read: {error}") from error
-        if about.format != FORMAT:
-            raise ConfigError(f"{path}: is of format {about.format}; this version reads format {FORMAT}")
+        if not 1 <= about.format <= FORMAT:
+            raise ConfigError(f"{path}: is of format {about.format}; this version reads formats 1 to {FORMAT}")
         require_field(about.field, path)
         return about
 
-    def stored(self, cells: Structured, path: Path, layers: dict[str, NDArray[Any]] | None = None) -> StoredMap:
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Fields of a cell that a file of this format has."""
+        return names_of(self.format)
+
+    def stored(
+        self,
+        cells: Structured,
+        path: Path,
+        layers: dict[str, NDArray[Any]] | None = None,
+        stripes: Witnesses | None = None,
+        pings: Witnesses | None = None,
+    ) -> StoredMap:
         """The map that a file holds; says so if its cells are no longer those that were written."""
-        found = HybridMap(self.field, cells, self.registration, self.notes)
-        if digest(found) != self.digest:
+        tables = (stripes or Witnesses(), pings or Witnesses())
+        found = HybridMap(self.field, cells, self.registration, self.notes, *tables)
+        if digest(found, self.names) != self.digest:
             log.warning("%s: its cells are not those that it was written with (digest %s)", path, self.digest)
         return StoredMap(found, self.scan, self.calibration, layers or {})
+
+
+def names_of(format_: int) -> tuple[str, ...]:
+    """Fields of a cell that a file of some format has."""
+    later = {name for since, names in ADDED.items() if since > format_ for name in names}
+    return tuple(name for name in RECORD.names or () if name not in later)
+
+
+def complete(cells: Structured, names: Collection[str]) -> None:
+    """Of labels from before there were probabilities, nobody said one."""
+    if "probability" not in names:
+        cells["probability"][cells["label"] != Label.UNKNOWN] = np.nan
+
+
+def table_of(pairs: Structured, field: MapField, path: Path) -> Witnesses:
+    """A table from the lines of a file.
+
+    Raises
+    ------
+    ConfigError
+        A line is about a cell beyond the field.
+    """
+    rows, columns = field.shape
+    if int(pairs["cell"].max(initial=0)) >= rows * columns:
+        raise ConfigError(f"{path}: names triggers of cells beyond its field of {rows} rows and {columns} columns")
+    return tabled(pairs["cell"], pairs["trigger"], rows * columns)
+
+
+def lines_of(found: HybridMap) -> dict[str, Structured]:
+    """The tables that a map has, line by line, by the name that they have in its files."""
+    tables = {"stripes": found.stripes, "pings": found.pings}
+    return {name: table.pairs() for name, table in tables.items() if table.known}
 
 
 def require_field(field: MapField, path: Path) -> None:
@@ -153,9 +201,7 @@ def put_back(about: About, parts: list[Structured], path: Path) -> Structured:
     rows, columns = about.field.shape
     times = np.zeros(cells.size, dtype=np.int64)
     for part in parts:
-        missing = [name for name in RECORD.names or () if name not in (part.dtype.names or ())]
-        if missing:
-            raise ConfigError(f"{path}: lacks {', '.join(missing)}; expected every field of a map's cells")
+        require_names(part.dtype.names or (), about, path)
         ix, iy = part["ix"].astype(np.int64), part["iy"].astype(np.int64)
         if ((ix < 0) | (ix >= columns) | (iy < 0) | (iy >= rows)).any():
             raise ConfigError(f"{path}: holds cells beyond its field of {rows} rows and {columns} columns")
@@ -163,6 +209,21 @@ def put_back(about: About, parts: list[Structured], path: Path) -> Structured:
         times += np.bincount(at, minlength=cells.size)
         if times.max(initial=0) > 1:
             raise ConfigError(f"{path}: holds a cell twice")
-        for name in FIELDS:
-            cells[name][at] = part[name]
+        for name in about.names:
+            if name not in ("ix", "iy"):
+                cells[name][at] = part[name]
+    complete(cells, about.names)
     return cells
+
+
+def require_names(there: Collection[str], about: About, path: Path) -> None:
+    """See that a file has every field that its format has.
+
+    Raises
+    ------
+    ConfigError
+        One is missing.
+    """
+    missing = [name for name in about.names if name not in there]
+    if missing:
+        raise ConfigError(f"{path}: lacks {', '.join(missing)}; expected every field of a map's cells")

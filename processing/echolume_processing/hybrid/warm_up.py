@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from echolume_messages.plan import MapField
-from echolume_processing.hybrid import tiles
+from echolume_processing.hybrid import tile_kernels
 from echolume_processing.hybrid.predict import Aperture, Band, Predictor
 from echolume_processing.hybrid.surface import WALL_MM, surface
 
@@ -18,4 +18,4 @@ def warm_up() -> None:
     where = Aperture(np.array([[0.0, 0.0, 150.0], [15.0, 0.0, 150.0]]), np.array([0.0, 0.0, -1.0]))
     predictor = Predictor(6.0, 343.0, Band(250e3, 512, 30e3, 60e3))
     predictor.spectra(surface(height_mm, field), where)
-    tiles.warm_up()
+    tile_kernels.warm_up()

@@ -1,4 +1,4 @@
-"""The hybrid subscriber: gathers a scan's points and pings, and makes the map when its ledger is closed."""
+"""The hybrid subscriber: a scan's map grows with its points and pings, and is finished when its ledger is closed."""
 
 from __future__ import annotations
 
@@ -13,10 +13,13 @@ import numpy as np
 
 from echolume_messages import topics
 from echolume_messages.bus import Bus, Message
+from echolume_messages.calibration import Calibration
 from echolume_messages.errors import EcholumeError
+from echolume_messages.plan import expand
 from echolume_messages.rig import Rig
 from echolume_messages.types import Structured
-from echolume_processing.evidence import Evidence, read_start
+from echolume_processing.evidence import Evidence, ScanStart, read_start
+from echolume_processing.hybrid.growing import GrowingMap
 from echolume_processing.hybrid.warm_up import warm_up
 from echolume_processing.ping import ping_from_record
 from echolume_processing.review import REPORTS
@@ -29,6 +32,8 @@ STALLED_S = 20.0
 HELD_RECORDS = 2000
 """Records of scans whose start is not known yet."""
 MAX_SCANS = 4
+SHOWN_EVERY_S = 2.0
+"""How often the growing map is shown at most: a picture of it costs as much as a hundred pings."""
 FRAMES_DEPTH = 8
 """Frames that may wait to be made pictures; of more, the oldest is not shown."""
 
@@ -42,9 +47,27 @@ class _Scan:
 
     evidence: Evidence
     kinds: dict[str, str]
+    stripes: int
+    """That the plan asks for."""
+    growing: GrowingMap
+    shown: int = 0
+    """Records that the last picture of the growing map rests on."""
+    shown_s: float = field(default_factory=time.monotonic)
     lags_ms: list[float] = field(default_factory=list[float])
     ledger: Json | None = None
     last_s: float = field(default_factory=time.monotonic)
+
+    @classmethod
+    def of(cls, start: ScanStart, calibration: Calibration) -> _Scan:
+        """A scan that has begun."""
+        kinds = {p.name: str(p.__struct_config__.tag) for p in start.plan.passes}
+        stripes = sum(kinds[step.pass_name] == "optical" for step in expand(start.plan))
+        return cls(Evidence.of(start, calibration), kinds, stripes, GrowingMap(calibration, start.plan.map))
+
+    @property
+    def records(self) -> int:
+        """Stripes and pings so far."""
+        return len(self.evidence.optical) + len(self.evidence.pings)
 
     def missing(self) -> dict[str, list[int]]:
         """Triggers that the ledger calls matched and that have not arrived in full, by pass."""
@@ -74,11 +97,12 @@ class HybridSubscriber:
             [topics.CAMERA_LEFT, topics.CAMERA_RIGHT], depth=FRAMES_DEPTH, refill=False, decimated=True
         )
         self._map = bus.publisher(topics.HYBRID_MAP)
+        self._growing = bus.publisher(topics.HYBRID_GROWING)
         self._done = bus.publisher(topics.HYBRID_DONE)
         self._scans: dict[str, _Scan | None] = {}
         self._held: dict[str, list[Message]] = {}
         self._held_ledgers: dict[str, Message] = {}
-        self._counts = {"records": 0, "maps": 0, "dropped": 0, "pictures": 0}
+        self._counts = {"records": 0, "maps": 0, "dropped": 0, "pictures": 0, "shown": 0}
         self._error = ""
 
     def step(self, timeout_s: float) -> None:
@@ -93,6 +117,8 @@ class HybridSubscriber:
             record = self._records.get(0.0)
         self._keep_frames(FRAMES_DEPTH)
         for name, scan in list(self._scans.items()):
+            if scan is not None:
+                self._grow(name, scan)
             if scan is not None and scan.ledger is not None:
                 self._finish_if_complete(name, scan)
 
@@ -123,8 +149,7 @@ class HybridSubscriber:
             name = start.scan
             found = None
             if start.calibration is not None and start.calibration.rig == self._rig:
-                kinds = {p.name: str(p.__struct_config__.tag) for p in start.plan.passes}
-                found = _Scan(Evidence.of(start, start.calibration), kinds)
+                found = _Scan.of(start, start.calibration)
             elif start.calibration is not None:
                 log.error("scan %s: its calibration is of rig %r; no map", name, start.calibration.rig)
         except EcholumeError as error:
@@ -186,12 +211,16 @@ class HybridSubscriber:
         key = (header.trigger, header.attempt)
         kind = scan.kinds.get(header.pass_name)
         if message.topic == topics.OPTICAL_POINTS and kind == "optical":
-            scan.evidence.add_optical(*key, cast("Structured", message.payload))
+            points = cast("Structured", message.payload)
+            if scan.evidence.add_optical(*key, points):
+                scan.growing.add_stripe(header.trigger, points)
         elif message.topic == topics.ULTRASONIC_POINTS and kind == "ultrasonic":
             scan.evidence.add_ultrasonic(*key, cast("Structured", message.payload))
         elif message.topic == topics.ECHOES and kind == "ultrasonic":
             try:
-                scan.evidence.add_ping(*key, ping_from_record(header, np.asarray(message.payload, dtype=np.int16)))
+                ping = ping_from_record(header, np.asarray(message.payload, dtype=np.int16))
+                if scan.evidence.add_ping(*key, ping):
+                    scan.growing.add_ping(ping)
             except ValueError as error:
                 log.error("trigger %d: the ping is skipped: %s", header.trigger, error)
                 return
@@ -204,6 +233,17 @@ class HybridSubscriber:
         if message.topic != topics.ECHOES:
             scan.lags_ms.append((time.monotonic_ns() - header.t_ns) * 1e-6)
 
+    def _grow(self, name: str, scan: _Scan) -> None:
+        """Nothing waits: prepare light's surface once it is whole, and show what there is."""
+        if len(scan.evidence.optical) == scan.stripes and not scan.growing.settled:
+            scan.growing.settle()
+        if scan.records == scan.shown or time.monotonic() - scan.shown_s < SHOWN_EVERY_S:
+            return
+        found = scan.growing.live()
+        scan.shown, scan.shown_s = scan.records, time.monotonic()
+        self._growing.put(found.cells, scan=name, calibration=scan.evidence.calibration.digest)
+        self._counts["shown"] += 1
+
     def _finish_if_complete(self, name: str, scan: _Scan) -> None:
         missing = scan.missing()
         if missing and time.monotonic() - scan.last_s < STALLED_S:
@@ -212,7 +252,7 @@ class HybridSubscriber:
             log.error("scan %s: %s did not arrive; the map is made without", name, missing)
         self._scans[name] = None
         try:
-            found, results = conclude(scan.evidence, self._out)
+            found, results = conclude(scan.evidence, self._out, grown=scan.growing)
         except OSError as error:
             self._error = (
                 f"scan {name}: its map cannot be written to {self._out}: {error.strerror}; "

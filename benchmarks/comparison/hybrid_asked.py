@@ -54,7 +54,7 @@ FROM: Mapping[str, tuple[str, str, str]] = {
     "glass_height_mm": ("demo", DEFAULT, "glass_height_mm"),
     "black_f1_2mm": ("demo", DEFAULT, "black_f1_2mm"),
     "false_transparent_pct": ("matte", DEFAULT, "transparent_pct"),
-    "tilted_unknown_pct": ("glass-steep", DEFAULT, "hidden_unknown_pct"),
+    "tilted_unknown_pct": ("glass-steep", DEFAULT, "glass_unknown_pct"),
     "hybrid_nees": ("demo", DEFAULT, "nees"),
     "hybrid_coverage95_pct": ("demo", DEFAULT, "coverage95_pct"),
     "synthesis_s": ("demo", DEFAULT, "seconds"),

@@ -61,7 +61,7 @@ def row(found: HybridMap, recorded: Recorded) -> Row:
         return float(scoring.score(found.image("front_mm"), None, there, cells)[key]) if cells.any() else NAN
 
     glass = said["glass"] or {}
-    hidden = truth.label == Label.UNKNOWN
+    transparent = truth.label == Label.TRANSPARENT
     within = said["consistency"]["non_edge"]
     stated = said["reliability"] or {}
     matte = replace(truth, front_mm=np.where(truth.label == Label.MATTE, truth.front_mm, np.nan))
@@ -77,7 +77,7 @@ def row(found: HybridMap, recorded: Recorded) -> Row:
         "glass_precision": _number(said["all"]["glass_precision"]),
         "glass_height_mm": _number(glass.get("median_abs_mm")),
         "transparent_pct": 100 * float(np.mean(label == Label.TRANSPARENT)),
-        "hidden_unknown_pct": 100 * float(np.mean(label[hidden] == Label.UNKNOWN)) if hidden.any() else NAN,
+        "glass_unknown_pct": 100 * float(np.mean(label[transparent] == Label.UNKNOWN)) if transparent.any() else NAN,
         "label_brier": _number(stated.get("label_brier")),
         "label_ece": _number(stated.get("label_ece")),
         "nees": _number(within["nees"]),

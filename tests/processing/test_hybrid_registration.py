@@ -17,6 +17,7 @@ from echolume_messages.geometry import rotation_from_vector, transform
 from echolume_messages.plan import MapField, UltrasonicPass, raster
 from echolume_messages.rig import ArraySettings
 from echolume_processing.hybrid.alignment import at_assumed_speed
+from echolume_processing.hybrid.heard import Heard, heard
 from echolume_processing.hybrid.model import MOVES, Registration
 from echolume_processing.hybrid.predict import Aperture
 from echolume_processing.hybrid.registration import ANEW_MM, register
@@ -128,6 +129,43 @@ def test_heights_far_from_those_that_registered_are_right_too(steps: Scan, undis
             height_mm = left["dz_mm"] + y_mm * left["rx_rad"] - x_mm * left["ry_rad"]
             height_mm -= 120 * left["speed_mps"] / registration.speed_of_sound_mps
             assert abs(height_mm) < 0.05
+
+
+def test_what_pings_met_follows_the_setup_that_was_found(steps: Scan, undisturbed: Registration) -> None:
+    """Contacts of a disturbed calibration, brought to the registered set-up, are those of the calibration that is right."""
+    off = {"dz_mm": -0.4, "rx_rad": 3.5e-3, "ry_rad": -3.5e-3, "speed_mps": 1.75}
+    scene = lit(stairs())
+    right, _ = steps.heard(steps.array, scene)
+    expected = heard(steps.pings, steps.array).following(right, undisturbed)
+    astray = wrong(steps.array, off)
+    found, predicted = steps.heard(astray, scene)
+    before = heard(steps.pings, astray)
+    after = before.following(found, register(found, predicted, scene)[2])
+    met = expected.valid & before.valid
+    assert met.sum() >= 12
+
+    def apart(one: Heard) -> tuple[float, float, float]:
+        place_mm, normal = (one.place_mm - expected.place_mm)[met], (one.normal - expected.normal)[met]
+        aside_mm = np.linalg.norm(place_mm[:, :2], axis=1)  # of one, a receiver more is taken for its plane's
+        return float(np.abs(place_mm[:, 2]).max()), float(np.median(aside_mm)), float(np.median(np.abs(normal)))
+
+    before_mm, *_ = apart(before)
+    height_mm, aside_mm, normal = apart(after)
+    assert before_mm > 1.0
+    assert height_mm < 0.05
+    assert aside_mm < 0.05
+    assert normal < 2e-4
+    path_mm = np.abs(after.path_mm - expected.path_mm)[met]
+    assert np.isfinite(path_mm).mean() > 0.8
+    assert np.nanmax(path_mm) < 0.05
+
+
+def test_a_registration_that_was_refused_moves_no_contact(steps: Scan) -> None:
+    found, _ = steps.heard(steps.array, lit(stairs()))
+    spoken = heard(steps.pings, steps.array)
+    still = spoken.following(found, Registration(0.0, found.air_mps, refused="nothing to compare"))
+    np.testing.assert_allclose(still.place_mm, spoken.place_mm, atol=1e-9)
+    np.testing.assert_allclose(still.normal, spoken.normal, atol=1e-12)
 
 
 def test_an_undisturbed_setup_stays(undisturbed: Registration) -> None:

@@ -118,17 +118,19 @@ def explain(
     shared = float(closed.seen[window_of(wide, field)].mean())
     registration = Registration()
     if shared >= SHARED:
+        before = found
         found, predicted, registration = register(found, predicted, scene)
-        spoken = spoken.raised(registration.dz_mm)
+        spoken = spoken.following(before, registration)
     else:
         cells.notes.append(
             f"light sees {100 * shared:.1f} % of the field: sound is not registered to it, but taken as calibrated"
         )
     state = _fill_holes(State(found, scene, predicted), closed.absorbing, cells, spoken)
     if closed.absorbing and registration.pings:
+        before = found
         found, predicted, again = register(found, state.predicted)
         state = State(found, state.scene, predicted)
-        spoken = spoken.raised(again.dz_mm)
+        spoken = spoken.following(before, again)
         registration = registration.then(again)
     find_plates(state, cells, spoken)
     by_trigger = np.array(found.triggers, dtype=np.uint32)

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from echolume_messages.calibration import ArrayCalibration
 from echolume_messages.types import EchoKind, Structured
+from echolume_processing.hybrid.model import Registration
 from echolume_processing.hybrid.plates import Plane
 from echolume_processing.hybrid.scipy_typed import NearestPoints
+from echolume_processing.hybrid.setup_error import faster, turns
+from echolume_processing.hybrid.sounding import Sounding
 from echolume_processing.ping import Ping
 from echolume_processing.ultrasonic.pipeline import UltrasonicPipeline
 
@@ -49,9 +52,30 @@ class Heard:
         """Pings that met a plane, (pings,)."""
         return np.isfinite(self.place_mm[:, 2])
 
-    def raised(self, dz_mm: float) -> Heard:
-        """All contacts higher by `dz_mm`; the paths stay, their array moves."""
-        return replace(self, place_mm=self.place_mm + np.array([0.0, 0.0, dz_mm]))
+    def following(self, found: Sounding, registration: Registration) -> Heard:
+        """What the same echoes say of a set-up that was registered.
+
+        Parameters
+        ----------
+        found
+            The pings as they were before.
+        registration
+            By what their array was moved, and by what sound was faster than they took it for.
+
+        Notes
+        -----
+        Contacts move with their array, and are further from it by as much as sound was faster.
+        """
+        value = registration.errors(found.speed_mps)
+        longer = 1 + faster(value, found.order)[:, None]
+        about_rig, about_emitter = turns(value)
+        emitter_mm = np.array([a.elements_mm[0] for a in found.apertures])
+        arm_mm = (self.place_mm - emitter_mm) * longer
+        return Heard(
+            arm_mm @ about_emitter.T + emitter_mm @ about_rig.T + value[[3, 4, 0]],
+            self.normal @ about_emitter.T,
+            self.path_mm * longer,
+        )
 
 
 @dataclass(frozen=True)

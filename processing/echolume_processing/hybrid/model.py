@@ -66,6 +66,18 @@ class Registration:
     refused: str = ""
     """Why nothing was moved."""
 
+    def errors(self, speed_mps: float) -> NDArray[np.float64]:
+        """Those in the order of `MOVES`, (10,): the speed relative to one, the drift from the middle to the last ping.
+
+        Parameters
+        ----------
+        speed_mps
+            At which the echoes were predicted.
+        """
+        told = np.array([getattr(self, name) for name in MOVES], dtype=np.float64)
+        told[-2:] /= speed_mps * np.array([1.0, 2.0])
+        return told
+
     def then(self, again: Registration) -> Registration:
         """Both of two registrations, the second made from where the first had moved the set-up."""
         if again.refused or not again.pings:

@@ -71,10 +71,15 @@ def displacements(elements_mm: NDArray[np.float64]) -> NDArray[np.float64]:
     )
 
 
+def turns(value: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What turned the array's place about the rig's origin, and all of it about its emitter, given the errors (10,)."""
+    about_rig = rotation_from_vector(value[[1, 2, 5]])
+    return about_rig, about_rig @ rotation_from_vector(np.array([value[6], value[7], 0.0]))
+
+
 def moved(apertures: Sequence[Aperture], value: NDArray[np.float64]) -> tuple[Aperture, ...]:
     """Where the array really stood, given the errors (10,)."""
-    about_rig = rotation_from_vector(value[[1, 2, 5]])
-    about_emitter = about_rig @ rotation_from_vector(np.array([value[6], value[7], 0.0]))
+    about_rig, about_emitter = turns(value)
     out: list[Aperture] = []
     for one in apertures:
         emitter_mm = one.elements_mm[0]

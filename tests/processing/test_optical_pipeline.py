@@ -94,7 +94,8 @@ def test_points_lie_on_the_laser_plane(pipeline: OpticalPipeline) -> None:
     xyz = np.column_stack([points[axis] for axis in ("x_mm", "y_mm", "z_mm")]).astype(np.float64)
     off_mm = xyz @ TRUTH.laser_normal - TRUTH.plane_offset_mm(30.0)
     active = points["source"] != OpticalSource.STEREO
-    assert np.abs(off_mm[active]).max() < 1e-4
+    assert np.ptp(off_mm[active]) < 1e-4, "float32"
+    assert np.abs(off_mm[active]).max() < 2e-3, "its stereo points move the plane by what they know of it"
     assert np.sqrt(np.mean(off_mm[~active] ** 2)) < 0.05
 
 

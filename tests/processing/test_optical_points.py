@@ -124,6 +124,9 @@ def test_joint_covariance_is_smaller_than_either() -> None:
         assert np.linalg.eigvalsh(covariance.full(larger) - covariance.full(both)).min() > -1e-12
 
 
+STRIPES = 24
+
+
 def moved(camera: CameraCalibration, u_px: float, v_px: float) -> CameraCalibration:
     """A calibration whose image centre is off."""
     rows = [list(row) for row in camera.camera_matrix]
@@ -134,10 +137,10 @@ def moved(camera: CameraCalibration, u_px: float, v_px: float) -> CameraCalibrat
 
 def test_covariances_of_emulated_stripes_are_honest() -> None:
     """Planes are 0.02 mm and cameras 0.01 px off, otherwise for each stripe; NEES averages to one."""
-    off_mm = 0.02 * np.random.default_rng(0).choice([-1, 1], 8)
-    off_px = 0.01 * np.random.default_rng(1).choice([-1, 1], (8, 4))
+    off_mm = 0.02 * np.random.default_rng(0).choice([-1, 1], STRIPES)
+    off_px = 0.01 * np.random.default_rng(1).choice([-1, 1], (STRIPES, 4))
     nees = []
-    for i, x_mm in enumerate(np.linspace(-90, 90, 8)):
+    for i, x_mm in enumerate(np.linspace(-90, 90, STRIPES)):
         scene = (matte, plate)[i % 2]()
         left, right = moved(camera_of(TRUTH.left), *off_px[i, :2]), moved(camera_of(TRUTH.right), *off_px[i, 2:])
         pipeline = OpticalPipeline.of(left, right, laser_of(), OpticalSettings(plane_sigma_mm=0.02, guide_sigma_mm=0.0))
@@ -166,8 +169,9 @@ def test_the_planes_covariance_enters_each_point_where_it_lies() -> None:
     plain = OpticalPipeline.of(camera_of(TRUTH.left), camera_of(TRUTH.right), laser_of()).measure(
         *pair(plate(10.0), 5.0, 3), 5.0
     )
-    assert np.array_equal(seen.points["z_mm"], plain.points["z_mm"])
+    np.testing.assert_allclose(seen.points["z_mm"], plain.points["z_mm"], atol=1e-3)
     stereo = seen.points["source"] == OpticalSource.STEREO
+    assert np.array_equal(seen.points["z_mm"][stereo], plain.points["z_mm"][stereo])
     assert np.array_equal(seen.covariance[:, stereo], plain.covariance[:, stereo])
     left = np.flatnonzero(seen.points["source"] == OpticalSource.ACTIVE_LEFT)
     for k in (left[5], left[len(left) // 2], left[-5]):
@@ -175,8 +179,29 @@ def test_the_planes_covariance_enters_each_point_where_it_lies() -> None:
         own_mm = laser.sigma_mm(5.0, place[1], place[2])
         assert own_mm is not None
         along = np.sqrt(NORMAL @ seen.matrices[k] @ NORMAL)
-        assert along == pytest.approx(np.hypot(own_mm, 0.004 * NORMAL @ TRUTH.guide_direction), rel=1e-3)
+        assert 0.95 * own_mm < along < np.hypot(own_mm, 0.003), "what the stripe's stereo points leave of the guide's 0.004"
     assert pipeline.plane_limit_mm == pytest.approx(0.04)
+
+
+@pytest.mark.parametrize("off_mm", [0.05, -0.03])
+def test_a_carriage_that_is_not_where_it_says_does_not_move_the_active_points(off_mm: float) -> None:
+    """The stripe's own stereo points tell where the plane was, also for what one camera alone sees."""
+    pipeline = OpticalPipeline.of(camera_of(TRUTH.left), camera_of(TRUTH.right), laser_of())
+    frames = pair(plate(10.0), 25.0, 4)
+    right = pipeline.measure(*frames, 25.0, 0.01)
+    wrong = pipeline.measure(*frames, 25.0 + off_mm, 0.03)
+    assert np.array_equal(right.points["row"], wrong.points["row"])
+    alone = pipeline.measure(frames[0], np.zeros_like(frames[1]), 25.0 + off_mm, 0.03)
+    active = right.points["source"] != OpticalSource.STEREO
+    assert np.abs(wrong.points["z_mm"] - right.points["z_mm"])[active].max() < 0.02
+    assert np.abs(wrong.joint_mm - right.joint_mm).max() < 0.02
+    stated = np.sqrt(NORMAL @ wrong.matrices[active] @ NORMAL)
+    assert 0 < stated.max() < 0.005
+    left = right.points["source"] == OpticalSource.ACTIVE_LEFT
+    rows, mine, other = np.intersect1d(right.points["row"][left], alone.points["row"], return_indices=True)
+    assert rows.size > 500
+    unaided = np.median(alone.points["z_mm"][other] - right.points["z_mm"][left][mine])
+    assert abs(unaided) > 1.5 * abs(off_mm), "one camera alone has nothing to tell it"
 
 
 def sides_of(frames: list[Frame], x_mm: float) -> list[Candidates]:

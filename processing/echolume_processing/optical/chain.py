@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from echolume_messages.types import OpticalSource, Structured
-from echolume_processing.optical import agreement, closed_form, covariance, epipolar, select
+from echolume_processing.optical import agreement, closed_form, covariance, epipolar, plane_shift, select
 from echolume_processing.optical.candidates import Candidates, View, gather
 
 Values = NDArray[np.float64]
@@ -81,11 +81,29 @@ def _write(
 
 
 @njit(cache=True, nogil=True)
+def _along_ray(point: Values, centre: Values, plane: Values, shift_mm: float, out: Values) -> None:
+    """Where the ray from a camera's centre to a point on the laser plane meets it when it is shifted."""
+    x, y, z = point[0] - centre[0], point[1] - centre[1], point[2] - centre[2]
+    times = shift_mm / (plane[0] * x + plane[1] * y + plane[2] * z)
+    out[0], out[1], out[2] = point[0] + times * x, point[1] + times * y, point[2] + times * z
+
+
+@njit(cache=True, nogil=True)
+def _camera_mm(left: View, right: View, terms: Terms, middle: Values) -> float:
+    """What the errors of both cameras' models do to the place of the stripe as they see it together."""
+    total = 0.0
+    for view, sigma_px in ((left, terms.left_px), (right, terms.right_px)):
+        away_mm = np.sqrt(((middle - view.centre_mm) ** 2).sum())
+        total += (0.5 * sigma_px * away_mm / view.lens[0]) ** 2
+    return np.sqrt(total)
+
+
+@njit(cache=True, nogil=True)
 def _active(
     side: Candidates, verdict: select.Verdicts, variance: Values, view: View, plane_mm2: Values, camera_px: float,
-    plane: Values, source: int, out: Structured, first: int,
+    plane: Values, shift_mm: float, source: int, out: Structured, first: int,
 ) -> Values:  # fmt: skip
-    """Write the active points of one camera; their covariance (6, n)."""
+    """Write the active points of one camera, on the plane where it really was; their covariance (6, n)."""
     kept, n = np.empty(len(verdict), np.int64), 0
     for k in range(len(verdict)):
         if verdict[k] <= select.LAST_BELIEVED:
@@ -95,7 +113,7 @@ def _active(
     row, flags = np.empty(n, np.int64), np.empty(n, np.uint8)
     for i in range(n):
         k = kept[i]
-        points[0, i], points[1, i], points[2, i] = side.active_mm[0, k], side.active_mm[1, k], side.active_mm[2, k]
+        _along_ray(side.active_mm[:, k], view.centre_mm, plane[0], shift_mm, points[:, i])
         sigma[i] = np.sqrt(variance[k] + camera_px * camera_px)
         row[i] = side.row[k]
         flags[i] = SATURATED * side.saturated[k] + BOTH * (verdict[k] == 0)
@@ -130,7 +148,8 @@ def run(
     distance_mm : float
         n.X of the laser plane.
     plane_mm2 : (6,)
-        Variance of its position: what multiplies 1, y, z, y^2, y z, z^2.
+        Variance of its position: what multiplies 1, y, z, y^2, y z, z^2. Active and joint points lie on the plane that
+        the stereo points of the same stripe measure, see `plane_shift`.
     out : (at least the rows of left twice and of right once,) OPTICAL_POINT
         Filled.
     """
@@ -163,18 +182,27 @@ def run(
         points, left.projection, right.projection, False, sigma_left, terms.left_px, sigma_right, stereo
     )  # fmt: skip
     _write(out, 0, points, stereo, row, flags, _STEREO)
-    joint, joint_covariance = np.empty((3, n)), np.empty((6, n))
-    variance = _plane_variance(points, plane_mm2)
-    covariance.constrain(points, stereo, terms.normal, distance_mm, variance, joint, joint_covariance)
     plane = closed_form.plane_from_pixel(right.centre_mm, right.ray_matrix, terms.normal, distance_mm)
     agreed = agreement.summary(active, seen[2:], plane, left.centre_mm, right.centre_mm, terms.normal)
+    shift_mm = 0.0
+    if n >= agreement.FEW_POINTS:
+        middle = np.array([active[0].mean(), active[1].mean(), active[2].mean()])
+        shift_mm, plane_mm2 = plane_shift.shift(
+            n, agreed[1], agreed[3], agreed[4], middle[1], middle[2], _camera_mm(left, right, terms, middle), plane_mm2
+        )
+    joint, joint_covariance = np.empty((3, n)), np.empty((6, n))
+    variance = _plane_variance(points, plane_mm2)
+    covariance.constrain(points, stereo, terms.normal, distance_mm + shift_mm, variance, joint, joint_covariance)
 
     surface = np.zeros((3, 4))
     surface[0, :3] = terms.normal
     surface[2, 3] = 1.0
-    at_left = _active(first, verdicts[0], variances[0], left, plane_mm2, terms.left_px, surface, _LEFT, out, n)
+    at_left = _active(
+        first, verdicts[0], variances[0], left, plane_mm2, terms.left_px, surface, shift_mm, _LEFT, out, n
+    )  # fmt: skip
     at_right = _active(
-        second, verdicts[1], variances[1], right, plane_mm2, terms.right_px, surface, _RIGHT, out, n + at_left.shape[1]
+        second, verdicts[1], variances[1], right, plane_mm2, terms.right_px, surface, shift_mm, _RIGHT, out,
+        n + at_left.shape[1],
     )  # fmt: skip
     m, last = n + at_left.shape[1], n + at_left.shape[1] + at_right.shape[1]
     every = np.empty((6, last))

@@ -1,4 +1,4 @@
-"""Smooth bent surfaces: from the ways of pings to a paraboloid, and to a map."""
+"""Smooth bent surfaces: from the ways of pings to arcs, and to a map."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from echolume_drivers.emulated import scene_file
 from echolume_messages.types import Label
+from echolume_processing.hybrid.arcs import STEEPEST_SINE, Arc
 from echolume_processing.hybrid.curved import curved_seed, first_height_mm
 from echolume_processing.hybrid.fuse import fuse
 from echolume_processing.hybrid.heard import Heard
@@ -38,6 +39,17 @@ class Ball:
     def path_mm(self, emitter_mm: np.ndarray, receivers_mm: np.ndarray) -> np.ndarray:
         x, y = np.meshgrid(np.linspace(-13, 13, 521), np.linspace(-13, 13, 521))
         z = self.top_mm - self.radius_mm + np.sqrt(self.radius_mm**2 - x**2 - y**2)
+        places = np.column_stack((x.ravel(), y.ravel(), z.ravel()))
+        there = np.linalg.norm(places - emitter_mm, axis=1)
+        return np.array([(there + np.linalg.norm(places - r, axis=1)).min() for r in receivers_mm])
+
+
+class Trough(Ball):
+    """Half a pipe lying along y."""
+
+    def path_mm(self, emitter_mm: np.ndarray, receivers_mm: np.ndarray) -> np.ndarray:
+        x, y = np.meshgrid(np.linspace(-15, 15, 601), np.linspace(-30, 30, 301))
+        z = self.top_mm - self.radius_mm + np.sqrt(self.radius_mm**2 - x**2)
         places = np.column_stack((x.ravel(), y.ravel(), z.ravel()))
         there = np.linalg.norm(places - emitter_mm, axis=1)
         return np.array([(there + np.linalg.norm(places - r, axis=1)).min() for r in receivers_mm])
@@ -92,6 +104,37 @@ def test_a_ball_is_recovered_from_the_paths_over_it(radius_mm: float) -> None:
     for bend in (seed.plane.bend_xx, seed.plane.bend_yy):
         assert bend == pytest.approx(-1 / radius_mm, rel=0.12)
     assert np.abs(first_height_mm(found, spoken) - 25.0).max() < 3.5
+
+
+def test_a_pipe_is_known_further_out_than_pings_met_it() -> None:
+    found, spoken = pings_over(Trough(30.0, 30.0), 0.02)
+    seed = curved_seed(found, spoken, np.arange(25))
+    assert seed is not None
+    assert np.abs(seed.place_mm[:, 0]).max() < 8
+    x_mm = np.arange(-25.0, 26.0)
+    true_mm = np.sqrt(30.0**2 - x_mm**2)
+    assert np.abs(seed.plane.at(x_mm, np.zeros_like(x_mm)) - true_mm).max() < 1.5
+    parabola_mm = 30.0 - x_mm**2 / 60.0
+    assert np.abs(parabola_mm - true_mm).max() > 2.5
+
+
+@given(st.floats(-0.6, 0.6), st.floats(-0.05, 0.05), st.floats(-15, 15))
+def test_an_arc_is_part_of_a_circle(slope: float, bend: float, along_mm: float) -> None:
+    arc = Arc(slope, bend)
+    height_mm, steep, bent = (float(v[0]) for v in arc.at(np.array([along_mm])))
+    if abs(bend) < 1e-9:
+        assert height_mm == pytest.approx(slope * along_mm, abs=1e-5)
+        return
+    cosine = 1 / np.hypot(1, slope)
+    radius_mm = 1 / (bend * cosine**3)
+    middle = np.array([-slope * cosine * radius_mm, cosine * radius_mm])
+    here = np.array([along_mm, height_mm]) - middle
+    if abs(slope * cosine + along_mm / radius_mm) < STEEPEST_SINE:
+        assert np.hypot(*here) == pytest.approx(abs(radius_mm), rel=1e-6)
+        assert here[0] + here[1] * steep == pytest.approx(0, abs=1e-5 * abs(radius_mm))
+        assert np.sign(bent) == np.sign(bend)
+    else:
+        assert bent == 0
 
 
 def test_the_echo_of_a_corner_is_no_bent_surface() -> None:

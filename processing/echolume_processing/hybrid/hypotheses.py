@@ -140,7 +140,7 @@ def plate(state: State, seed: Seed, light: Light, also: Mask) -> tuple[Patch, St
 
 
 def _beyond_mm(seed: Seed, field: MapField) -> NDArray[np.float64] | None:
-    """How far a bent surface may be from where it is said to go on: by what a sphere leaves its paraboloid."""
+    """How far a bent surface may be from where it is said to go on: by what a parabola leaves an arc."""
     plane = seed.plane
     if not plane.bent:
         return None

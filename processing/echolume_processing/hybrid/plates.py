@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echolume_messages.plan import MapField
+from echolume_processing.hybrid.arcs import Arc
 from echolume_processing.hybrid.model import cell_centres_mm
 from echolume_processing.hybrid.predict import Aperture
 from echolume_processing.hybrid.sounding import CEILING_MM, Sounding, Spectra
@@ -24,8 +25,11 @@ STEEPEST = 0.4
 
 @dataclass(frozen=True)
 class Plane:
-    """A plane, or what is bent from one: with dx = x - x_mm and dy = y - y_mm,
-    z = z_mm + slope_x dx + slope_y dy + (bend_xx dx^2 + bend_yy dy^2) / 2 + bend_xy dx dy."""
+    """A plane, or what is bent from one; z_mm, slopes and bends are the surface's own at x_mm, y_mm.
+
+    Along its two main directions a bent surface follows circular arcs, and its height is the sum of both: a cylinder is
+    exact, a ball to the fourth order in the distance over its radius.
+    """
 
     x_mm: float
     y_mm: float
@@ -50,18 +54,29 @@ class Plane:
     def at(self, x_mm: NDArray[np.float64], y_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Height at points."""
         dx, dy = x_mm - self.x_mm, y_mm - self.y_mm
-        height_mm = self.z_mm + self.slope_x * dx + self.slope_y * dy
-        if self.bent:
-            height_mm += 0.5 * (self.bend_xx * dx**2 + self.bend_yy * dy**2) + self.bend_xy * dx * dy
-        return height_mm
+        if not self.bent:
+            return self.z_mm + self.slope_x * dx + self.slope_y * dy
+        axes, one, other = self._arcs
+        return self.z_mm + one.at(axes[0, 0] * dx + axes[1, 0] * dy)[0] + other.at(axes[0, 1] * dx + axes[1, 1] * dy)[0]
 
     def slope_at(
         self, x_mm: NDArray[np.float64], y_mm: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """dz/dx and dz/dy at points."""
         dx, dy = x_mm - self.x_mm, y_mm - self.y_mm
-        along_x = self.slope_x + self.bend_xx * dx + self.bend_xy * dy
-        return along_x, self.slope_y + self.bend_xy * dx + self.bend_yy * dy
+        if not self.bent:
+            flat = np.zeros_like(dx)
+            return flat + self.slope_x, flat + self.slope_y
+        axes, one, other = self._arcs
+        s, t = one.at(axes[0, 0] * dx + axes[1, 0] * dy)[1], other.at(axes[0, 1] * dx + axes[1, 1] * dy)[1]
+        return axes[0, 0] * s + axes[0, 1] * t, axes[1, 0] * s + axes[1, 1] * t
+
+    @property
+    def _arcs(self) -> tuple[NDArray[np.float64], Arc, Arc]:
+        """Main directions, the columns (2, 2), and the arc along each of them."""
+        bends, axes = np.linalg.eigh([[self.bend_xx, self.bend_xy], [self.bend_xy, self.bend_yy]])
+        slopes = axes.T @ np.array([self.slope_x, self.slope_y])
+        return axes, Arc(float(slopes[0]), float(bends[0])), Arc(float(slopes[1]), float(bends[1]))
 
     def image(self, field: MapField) -> NDArray[np.float64]:
         """Height at each cell of a field."""
@@ -80,17 +95,19 @@ class Plane:
         return centre_mm[:, :2] + above[:, None] * slope
 
     def _nearest(self, centre_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Newton's way to where the line to each point stands upright on the surface."""
-        x, y = centre_mm[:, 0].copy(), centre_mm[:, 1].copy()
+        """Newton's way to where the line to each point stands upright on the surface, along its main directions."""
+        axes, one, other = self._arcs
+        here = np.array([self.x_mm, self.y_mm])
+        u0, v0 = ((centre_mm[:, :2] - here) @ axes).T
+        u, v = np.zeros_like(u0), np.zeros_like(v0)  # from where it bends least: further out Newton may overshoot
         for _ in range(NEAREST_ROUNDS):
-            below = self.at(x, y) - centre_mm[:, 2]
-            sx, sy = self.slope_at(x, y)
-            gx, gy = x - centre_mm[:, 0] + below * sx, y - centre_mm[:, 1] + below * sy
-            xx, yy = 1 + sx * sx + below * self.bend_xx, 1 + sy * sy + below * self.bend_yy
-            xy = sx * sy + below * self.bend_xy
-            size = np.maximum(xx * yy - xy * xy, LEAST_SIZE)
-            x, y = x - (yy * gx - xy * gy) / size, y - (xx * gy - xy * gx) / size
-        return np.column_stack((x, y))
+            (zu, su, bu), (zv, sv, bv) = one.at(u), other.at(v)
+            below = self.z_mm + zu + zv - centre_mm[:, 2]
+            gu, gv = u - u0 + below * su, v - v0 + below * sv
+            uu, vv, uv = 1 + su * su + below * bu, 1 + sv * sv + below * bv, su * sv
+            size = np.maximum(uu * vv - uv * uv, LEAST_SIZE)
+            u, v = u - (vv * gu - uv * gv) / size, v - (uu * gv - uv * gu) / size
+        return here + np.column_stack((u, v)) @ axes.T
 
     def raised(self, dz_mm: float) -> Plane:
         """The same, higher by `dz_mm`."""

@@ -1,0 +1,35 @@
+"""Circular arcs: what a bent surface does along each of its main directions, beyond where a parabola is near enough."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+STEEPEST_SINE = 0.98
+"""Where the arc is as steep as this it goes on straight, so that there is a height everywhere."""
+
+Values = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Arc:
+    """The arc through 0 that has a slope and a second derivative (1/mm) there; a straight line if that is 0."""
+
+    slope: float
+    bend: float
+
+    def at(self, along_mm: Values) -> tuple[Values, Values, Values]:
+        """Height (mm), slope and second derivative (1/mm) so far along."""
+        cosine_here = 1.0 / np.hypot(1.0, self.slope)
+        sine_here, per_mm = self.slope * cosine_here, self.bend * cosine_here**3
+        whole = sine_here + along_mm * per_mm
+        sine = np.clip(whole, -STEEPEST_SINE, STEEPEST_SINE)  # of the angle that the surface has there
+        beyond = sine != whole
+        arc_mm = along_mm.copy()
+        arc_mm[beyond] = (sine[beyond] - sine_here) / per_mm if per_mm else 0.0
+        cosine = np.sqrt(1.0 - sine**2)
+        slope = sine / cosine
+        height_mm = arc_mm * (sine + sine_here) / (cosine + cosine_here) + (along_mm - arc_mm) * slope
+        return height_mm, slope, np.where(beyond, 0.0, per_mm / cosine**3)

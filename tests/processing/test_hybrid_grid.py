@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from echolume_messages.plan import MapField
 from echolume_messages.types import OPTICAL_POINT, ULTRASONIC_POINT, OpticalSource, Provenance
 from echolume_processing.hybrid.baselines import baselines, nearest, union
-from echolume_processing.hybrid.grid import accumulate
+from echolume_processing.hybrid.grid import accumulate, gather
 
 FIELD = MapField(x_mm=(0.0, 4.0), y_mm=(0.0, 3.0), cell_mm=1.0)
 
@@ -58,9 +61,57 @@ def test_one_absurd_height_leaves_the_other_cells_as_they_are() -> None:
     rows = [(x, y, z, OpticalSource.STEREO) for x, y, z in zip(*rng.uniform(0, 3, (3, 60)), strict=True)]
     one = accumulate(optical(rows), FIELD)
     two = accumulate(optical([*rows, (3.5, 0.5, 4e15, OpticalSource.STEREO)]), FIELD)
-    np.testing.assert_array_equal(two.height_mm[:, :3], one.height_mm[:, :3])
+    np.testing.assert_array_equal(two.height_mm[:, :2], one.height_mm[:, :2])
+    assert np.abs(two.height_mm - one.height_mm)[:, 2].max() < 1.0, "its neighbour is no slope, but a neighbour"
     np.testing.assert_array_equal(two.sigma_mm[:, :3], one.sigma_mm[:, :3])
     assert two.height_mm[0, 3] > 3.9e15
+
+
+def stripes(height_mm: Callable[[np.ndarray, np.ndarray], np.ndarray], at_mm: float) -> np.ndarray:
+    """One stripe in each column of cells, so far from its low side, on a surface."""
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(0.0, 20.0) + at_mm, np.arange(0.0, 20.0, 0.23) + 0.01))
+    return optical([(*p, OpticalSource.STEREO) for p in zip(x, y, height_mm(x, y), strict=True)])
+
+
+SQUARE = MapField(x_mm=(0.0, 20.0), y_mm=(0.0, 20.0), cell_mm=1.0)
+MIDDLES = np.meshgrid(np.arange(0.5, 20.0), np.arange(0.5, 20.0))
+
+
+@pytest.mark.parametrize("at_mm", [0.05, 0.3, 0.9])
+@pytest.mark.parametrize(("slope_x", "slope_y"), [(0.0, 0.0), (0.6, 0.0), (-1.5, 0.4), (0.1, -0.9)])
+def test_heights_are_those_at_the_centres_of_the_cells(at_mm: float, slope_x: float, slope_y: float) -> None:
+    points = stripes(lambda x, y: 30 + slope_x * x + slope_y * y, at_mm)
+    exact_mm = 30 + slope_x * MIDDLES[0] + slope_y * MIDDLES[1]
+    assert np.abs(accumulate(points, SQUARE).height_mm - exact_mm).max() < 0.002 + 0.06 * abs(slope_y)
+    off_mm = np.abs(gather(points, SQUARE).grid.height_mm - exact_mm).max()
+    assert off_mm >= 0.9 * abs(slope_x * (at_mm - 0.5)) - 0.06 * abs(slope_y)
+
+
+def test_a_step_stays_where_it_is() -> None:
+    points = stripes(lambda x, y: np.where(x < 8, 5.0, 25.0), 0.1)
+    np.testing.assert_allclose(accumulate(points, SQUARE).height_mm, np.where(MIDDLES[0] < 8, 5.0, 25.0), atol=1e-6)
+
+
+def test_a_balls_flank_is_at_its_own_height() -> None:
+    def ball(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return np.sqrt(np.maximum(14.0**2 - (x - 10) ** 2 - (y - 10) ** 2, 0))
+
+    grid = accumulate(stripes(ball, 0.1), SQUARE)
+    inside = np.hypot(MIDDLES[0] - 10, MIDDLES[1] - 10) < 11
+    off_mm = np.abs(grid.height_mm - ball(*(m.clip(0.2, 19.8) for m in MIDDLES)))[inside]
+    assert off_mm.max() < 0.12
+    assert np.median(off_mm) < 0.02
+
+
+def test_stereo_points_do_not_count_beside_the_active_ones_that_they_are_made_of() -> None:
+    places = [(0.5, 0.1 * k, 10.0) for k in range(1, 9)]
+    both = [(*p, s) for p in places for s in (OpticalSource.ACTIVE_LEFT, OpticalSource.ACTIVE_RIGHT)]
+    alone = accumulate(optical(both), FIELD).sigma_mm[0, 0]
+    with_stereo = accumulate(optical([*both, *((*p, OpticalSource.STEREO) for p in places)]), FIELD)
+    assert with_stereo.sigma_mm[0, 0] == alone
+    assert with_stereo.count[0, 0] == 24
+    only = accumulate(optical([(*p, OpticalSource.STEREO) for p in places]), FIELD).sigma_mm[0, 0]
+    assert only == pytest.approx(1.2533 * 0.05 / np.sqrt(8))
 
 
 def test_no_points_make_an_empty_grid() -> None:

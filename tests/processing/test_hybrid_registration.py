@@ -132,7 +132,7 @@ def test_heights_far_from_those_that_registered_are_right_too(steps: Scan, undis
 
 
 def test_what_pings_met_follows_the_setup_that_was_found(steps: Scan, undisturbed: Registration) -> None:
-    """Contacts of a disturbed calibration, brought to the registered set-up, are those of the calibration that is right."""
+    """Contacts of a disturbed calibration, brought to the registered set-up, are those of the right calibration."""
     off = {"dz_mm": -0.4, "rx_rad": 3.5e-3, "ry_rad": -3.5e-3, "speed_mps": 1.75}
     scene = lit(stairs())
     right, _ = steps.heard(steps.array, scene)

@@ -179,7 +179,9 @@ def test_the_planes_covariance_enters_each_point_where_it_lies() -> None:
         own_mm = laser.sigma_mm(5.0, place[1], place[2])
         assert own_mm is not None
         along = np.sqrt(NORMAL @ seen.matrices[k] @ NORMAL)
-        assert 0.95 * own_mm < along < np.hypot(own_mm, 0.003), "what the stripe's stereo points leave of the guide's 0.004"
+        assert 0.95 * own_mm < along < np.hypot(own_mm, 0.003), (
+            "what the stripe's stereo points leave of the guide's 0.004"
+        )
     assert pipeline.plane_limit_mm == pytest.approx(0.04)
 
 

@@ -21,9 +21,6 @@ MARGIN_MM = 80.0
 """Sound sees this far beyond the map."""
 OCCLUDED_SIGMA_MM = 2.0
 CONFIRMED_SIGMA_MM = 0.5
-TWO_IMAGES = 1.35
-"""Stereo and either camera's own points are three from two images: their median varies by so much more than that of as
-many independent ones; by 1.5 if the third told nothing."""
 RIM_MM, RIM_REACH_MM = 0.5, 4.0
 """The doubt which side of a rim a cell lies on falls by e over the first, and ends at the second."""
 STEP_BETWEEN_MM = 3.0
@@ -68,7 +65,7 @@ class Cells:
         self._optical_mm = np.where(closed.seen, grid.height_mm, np.nan)
         view, seen, occluded = self._cells, closed.seen, closed.occluded
         view["front_mm"][seen] = grid.height_mm[seen]
-        view["sigma_mm"][seen] = (grid.sigma_mm * _of_two_images(grid.provenance))[seen]
+        view["sigma_mm"][seen] = grid.sigma_mm[seen]
         view["label"][seen] = Label.MATTE
         view["provenance"][seen] = grid.provenance[seen]
         view["optical_n"] = np.where(seen, np.minimum(grid.count, _COUNT_LIMIT), 0)
@@ -232,12 +229,6 @@ class Cells:
 def _off_rim_mm(mask: Mask, cell_mm: float) -> NDArray[np.float64]:
     """Distance of each cell's centre to the rim of a mask."""
     return (np.where(mask, depth_inside(mask), distance_to(mask)) - 0.5) * cell_mm
-
-
-def _of_two_images(provenance: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Factor on the sigmas of cells that rest on stereo and on both cameras' own points."""
-    every = np.uint8(Provenance.STEREO | Provenance.ACTIVE_LEFT | Provenance.ACTIVE_RIGHT)
-    return np.where((provenance & every) == every, np.sqrt(TWO_IMAGES), 1.0)
 
 
 def _rise_between(height_mm: NDArray[np.float64]) -> NDArray[np.float64]:

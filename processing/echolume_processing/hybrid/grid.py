@@ -1,8 +1,8 @@
-"""Optical points to cells: a median per cell that does not depend on the order of arrival."""
+"""Optical points to cells: a height per cell, at its centre, that does not depend on the order of arrival."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
 
 import numpy as np
@@ -16,6 +16,10 @@ STEPS_PER_MM = 1000.0
 """Heights are compared as whole micrometres, so that equal evidence gives equal bits."""
 LEAST_SIGMA_MM = 0.01
 SPREAD_OF_MAD = 1.4826
+GENTLEST, STEEPEST = 0.02, 2.5
+"""Slopes between which heights are brought to the centres of their cells."""
+LEAST_RUN = 0.3
+"""Points of neighbouring cells are taken to be no nearer than this share of a cell."""
 _LARGEST = np.iinfo(np.int64).max
 
 _BIT_OF_SOURCE = {
@@ -31,7 +35,7 @@ class OpticalGrid:
 
     field: MapField
     height_mm: NDArray[np.float64]
-    """Median height; nan where no point fell."""
+    """nan where no point fell."""
     sigma_mm: NDArray[np.float64]
     count: NDArray[np.int64]
     provenance: NDArray[np.uint8]
@@ -48,8 +52,18 @@ def cell_index(field: MapField, x_mm: NDArray[np.floating], y_mm: NDArray[np.flo
     return np.where(inside, iy * columns + ix, -1)
 
 
+@dataclass(frozen=True)
+class Gathered:
+    """What the points of each cell say by themselves; all images have the shape of the field."""
+
+    grid: OpticalGrid
+    """Heights are the medians of the points, wherever in their cells those lie."""
+    aside_mm: NDArray[np.float64]
+    """By how much their middle is off the cell's centre in x and in y, (2, rows, columns); 0 where there is none."""
+
+
 def accumulate(points: Structured, field: MapField, triggers: Triggers | None = None) -> OpticalGrid:
-    """Median height, spread, count and sources of the optical points in each cell.
+    """Height, spread, count and sources of the optical points in each cell.
 
     Parameters
     ----------
@@ -63,19 +77,28 @@ def accumulate(points: Structured, field: MapField, triggers: Triggers | None = 
     Returns
     -------
     OpticalGrid
-        The standard deviation of a cell is that of its median: 1.2533 times the larger of the robust spread and
-        the points' own sigma, over the root of their number.
+        See `gather` and `centred`.
+    """
+    return centred(gather(points, field, triggers))
+
+
+def gather(points: Structured, field: MapField, triggers: Triggers | None = None) -> Gathered:
+    """Median height, spread, count and sources of the optical points in each cell, and where in it they lie.
 
     Notes
     -----
     Points are sorted by cell and height in whole micrometres before anything is counted, so any order of
-    arrival gives the same bits. A cell that straddles a step gives the height of its majority.
+    arrival gives the same bits. A cell that straddles a step gives the height of its majority. The standard
+    deviation of a cell is that of its median: 1.2533 times the larger of the robust spread and the points' own
+    sigma, over the root of their number; a stereo point, which is made of the same two image points as the active ones
+    of its row, does not count beside them.
     """
     rows, columns = field.shape
     height_mm = np.full(rows * columns, np.nan)
     sigma_mm = np.full(rows * columns, np.nan)
     count = np.zeros(rows * columns, dtype=np.int64)
     provenance = np.zeros(rows * columns, dtype=np.uint8)
+    aside_mm = np.zeros((2, rows * columns))
     cell = cell_index(field, points["x_mm"], points["y_mm"])
     good = (cell >= 0) & np.isfinite(points["z_mm"])
     cell, used = cell[good], points[good]
@@ -88,12 +111,18 @@ def accumulate(points: Structured, field: MapField, triggers: Triggers | None = 
         spread = 0.5 * _median_per_cell(cell, np.abs(2 * steps - twice[cell]))[1] * SPREAD_OF_MAD / STEPS_PER_MM
         own_mm = _median_per_cell(cell, own_steps)[1] / STEPS_PER_MM
         height_mm[cells] = median / STEPS_PER_MM
-        sigma_mm[cells] = np.maximum(LEAST_SIGMA_MM, 1.2533 * np.maximum(spread, own_mm) / np.sqrt(number))
+        stereo = np.bincount(cell[used["source"] == OpticalSource.STEREO], minlength=rows * columns)[cells]
+        images = np.maximum(stereo, number - stereo)
+        sigma_mm[cells] = np.maximum(LEAST_SIGMA_MM, 1.2533 * np.maximum(spread, own_mm) / np.sqrt(images))
         count[cells] = number
+        for axis, name in enumerate(("x_mm", "y_mm")):
+            place = np.round(used[name].astype(np.float64) * STEPS_PER_MM)  # whole numbers: their sum is exact
+            middle_mm = np.bincount(cell, place, rows * columns)[cells] / (number * STEPS_PER_MM)
+            aside_mm[axis, cells] = middle_mm - _centres_mm(field, axis, cells)
         for source, bit in _BIT_OF_SOURCE.items():
             provenance[cell[used["source"] == source]] |= np.uint8(bit)
     shape = field.shape
-    return OpticalGrid(
+    grid = OpticalGrid(
         field,
         height_mm.reshape(shape),
         sigma_mm.reshape(shape),
@@ -101,6 +130,45 @@ def accumulate(points: Structured, field: MapField, triggers: Triggers | None = 
         provenance.reshape(shape),
         Witnesses() if triggers is None else tabled(cell, triggers[good], rows * columns),
     )
+    return Gathered(grid, aside_mm.reshape(2, *shape))
+
+
+def centred(gathered: Gathered) -> OpticalGrid:
+    """Heights at the centres of the cells: along the slope from where in each cell its points lie.
+
+    Notes
+    -----
+    A stripe crosses a column of cells at one place, which is off the middle by up to half a cell. The slope is that
+    between neighbouring cells: the harmonic mean of those to either side (van Leer, doi:10.1016/0021-9991(74)90019-9),
+    which is 0 on a crest and where one side is level, as at a step; where a neighbour is missing, that to the other
+    one. Slopes beyond `STEEPEST` are steps, those below `GENTLEST` noise.
+    """
+    grid = gathered.grid
+    height_mm = grid.height_mm.copy()
+    for axis, along in ((0, 1), (1, 0)):
+        place_mm = gathered.aside_mm[axis]
+        rise_mm = np.diff(grid.height_mm, axis=along)
+        run_mm = np.maximum(grid.field.cell_mm + np.diff(place_mm, axis=along), LEAST_RUN * grid.field.cell_mm)
+        missing = np.full_like(rise_mm.take([0], axis=along), np.nan)
+        slope = rise_mm / run_mm
+        before, after = (np.concatenate(pair, axis=along) for pair in ((missing, slope), (slope, missing)))
+        height_mm -= _limited(before, after) * place_mm
+    return replace(grid, height_mm=height_mm)
+
+
+def _limited(before: NDArray[np.float64], after: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Slope of cells between those to either side."""
+    one, other = np.where(np.isfinite(before), before, after), np.where(np.isfinite(after), after, before)
+    same = one * other > 0
+    mean = np.divide(2 * one * other, one + other, out=np.zeros_like(one), where=same)
+    return np.where((np.abs(mean) >= GENTLEST) & (np.abs(mean) <= STEEPEST), mean, 0.0)
+
+
+def _centres_mm(field: MapField, axis: int, cells: NDArray[np.int64]) -> NDArray[np.float64]:
+    """x (axis 0) or y (1) of the centres of some cells by their flat index."""
+    iy, ix = np.divmod(cells, field.shape[1])
+    low_mm, number = (field.x_mm[0], ix) if axis == 0 else (field.y_mm[0], iy)
+    return low_mm + (number + 0.5) * field.cell_mm
 
 
 def _median_per_cell(

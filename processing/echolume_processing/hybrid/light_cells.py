@@ -8,7 +8,7 @@ import numpy as np
 
 from echolume_messages.plan import MapField
 from echolume_messages.types import OPTICAL_POINT, Structured
-from echolume_processing.hybrid.grid import OpticalGrid, accumulate, cell_index
+from echolume_processing.hybrid.grid import OpticalGrid, cell_index, centred, gather
 from echolume_processing.hybrid.witnesses import Witnesses, tabled
 
 IMAGES = ("height_mm", "sigma_mm", "count", "provenance")
@@ -22,14 +22,14 @@ class LightCells:
         self._columns: list[dict[int, Structured]] = [{} for _ in range(field.shape[1])]
         self._touched: dict[int, tuple[int, ...]] = {}
         self._stripes: Witnesses | None = None
-        self._grid = accumulate(np.zeros(0, dtype=OPTICAL_POINT), field)
+        self._gathered = gather(np.zeros(0, dtype=OPTICAL_POINT), field)
 
     @property
     def grid(self) -> OpticalGrid:
-        """Of all stripes so far; its images change with the next stripe."""
+        """Of all stripes so far; its images may change with the next stripe."""
         if self._stripes is None:
             self._stripes = self._witnesses()
-        return replace(self._grid, stripes=self._stripes)
+        return replace(centred(self._gathered), stripes=self._stripes)
 
     def put(self, trigger: int, points: Structured) -> None:
         """Take a stripe; of a trigger that was acquired twice the later points replace the earlier.
@@ -58,9 +58,10 @@ class LightCells:
     def _renew(self, columns: list[int]) -> None:
         """Make the cells of some columns again from the points in them."""
         parts = [part for column in columns for part in self._columns[column].values()]
-        fresh = accumulate(np.concatenate(parts) if parts else np.zeros(0, dtype=OPTICAL_POINT), self._field)
+        fresh = gather(np.concatenate(parts) if parts else np.zeros(0, dtype=OPTICAL_POINT), self._field)
         for name in IMAGES:
-            getattr(self._grid, name)[:, columns] = getattr(fresh, name)[:, columns]
+            getattr(self._gathered.grid, name)[:, columns] = getattr(fresh.grid, name)[:, columns]
+        self._gathered.aside_mm[:, :, columns] = fresh.aside_mm[:, :, columns]
 
     def _witnesses(self) -> Witnesses:
         """Stripes of each cell."""

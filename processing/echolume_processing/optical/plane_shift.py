@@ -47,7 +47,7 @@ def shift(
     AT-left and AT-right agree is one measurement of that, weighed against the calibration by Kalman's gain. The
     noise of neighbouring rows is the same speckle, so that only every `LAG_ROWS` of them counts.
     """
-    if count < FEW_POINTS or not amplification != 0.0:
+    if count < FEW_POINTS or amplification == 0.0:
         return 0.0, plane_mm2
     told = MEDIAN_X_MEAN * noise_mm * noise_mm * LAG_ROWS / (count * amplification * amplification)
     told += camera_mm * camera_mm

@@ -257,6 +257,19 @@ def test_flags_tell_points_that_both_cameras_see(pipeline: OpticalPipeline) -> N
     assert seen.counts["both"] > 500
 
 
+@pytest.mark.parametrize("edge_mm", [20.0, 33.0])
+def test_a_surface_ends_where_it_ends_and_not_where_its_blur_does(pipeline: OpticalPipeline, edge_mm: float) -> None:
+    block = SceneBuilder("block").box((-40, 40), (-edge_mm, edge_mm), 20.0).build()
+    for seed, x_mm in enumerate((-20.0, 5.0, 30.0)):
+        seen = pipeline.measure(*pair(block, x_mm, seed), x_mm)
+        assert seen.counts["fading"] > 0
+        for source in OpticalSource:
+            points = seen.points[seen.points["source"] == source]
+            top = points["y_mm"][np.abs(points["z_mm"] - 20) < 1]
+            assert edge_mm - 0.7 < top.max() < edge_mm + 0.2
+            assert edge_mm - 0.7 < -top.min() < edge_mm + 0.2
+
+
 def false_stripe(frame: Frame, rows: slice, column: float, crest: float, sigma_px: float) -> Frame:
     """The frame with one more stripe, upright."""
     out = frame.astype(np.float64)

@@ -66,7 +66,7 @@ class StripePoints:
         Of each point: xx, xy, xz, yy, yz, zz in mm^2; `matrices` gives them as (n, 3, 3).
     joint_mm, joint_covariance : (3, m), (6, m) float64
         Stereo points with the laser plane as one more measurement, in the order of the stereo points.
-    verdicts : two of (8,) int64
+    verdicts : two of (9,) int64
         How many candidates of the left and of the right camera met each `Verdict`.
     agreement : Agreement
         Of both cameras' heights.

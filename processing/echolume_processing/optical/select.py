@@ -37,10 +37,12 @@ class Verdict(IntEnum):
     """Much darker than the stripe elsewhere."""
     SHORT = 7
     """Too few neighbouring rows agree."""
+    FADING = 8
+    """Less than half as bright as its run, at the run's end: the lens blurs it beyond where the surface ends."""
 
 
 # Plain numbers for the compiled code.
-_BOTH, _ALONE, _OUTSIDE, _SECONDARY, _CONTRADICTED, _ODD, _WEAK, _SHORT = (int(v) for v in Verdict)
+_BOTH, _ALONE, _OUTSIDE, _SECONDARY, _CONTRADICTED, _ODD, _WEAK, _SHORT, _FADING = (int(v) for v in Verdict)
 LAST_BELIEVED = int(Verdict.ALONE)
 VERDICTS = len(Verdict)
 
@@ -61,6 +63,10 @@ LEAST_OFF_PX, OFF_SIGMAS = 0.7, 4.5
 """How far a pair may lie from where the plane predicts it, besides what all pairs of the stripe have in common."""
 BRIGHTER = 1e5
 """A row more counts more than any amplitude."""
+FADED_ROWS = 4
+"""The blur reaches no further beyond the end of a surface."""
+USUAL_ROWS = 6
+"""So many rows further in tell how bright a run is; at its very end it is half as bright."""
 FEW = 20
 LAG_ROWS = 4
 """Rows so far apart do not share their speckle grain."""
@@ -120,18 +126,79 @@ def _agree(side: Candidates, match: Match) -> tuple[Verdicts, Flags]:
     for n in range(len(z)):
         verdict[n] = _OUTSIDE if np.isnan(z[n]) else _SHORT
         allowed[n] = match.partner[n] >= 0 and abs(off[n] - middle) < limit
-    length = _run_rows(side.start, side.row, z, allowed)
     row_agreed = np.zeros(len(side.start) - 1, np.bool_)
-    for r in range(len(row_agreed)):
-        best, chosen = 0.0, -1
-        for n in range(side.start[r], side.start[r + 1]):
-            score = min(length[n], SURE_ROWS) * BRIGHTER + amplitude[n]
-            if length[n] >= LEAST_AGREED_ROWS and score > best:
-                best, chosen = score, n
-        if chosen >= 0:
-            row_agreed[r] = True
-            verdict[chosen] = _BOTH
+    for _ in range(2):
+        length = _run_rows(side.start, side.row, z, allowed)
+        row_agreed[:] = False
+        for r in range(len(row_agreed)):
+            best, chosen = 0.0, -1
+            for n in range(side.start[r], side.start[r + 1]):
+                if verdict[n] == _BOTH:
+                    verdict[n] = _SHORT
+                score = min(length[n], SURE_ROWS) * BRIGHTER + amplitude[n]
+                if length[n] >= LEAST_AGREED_ROWS and score > best:
+                    best, chosen = score, n
+            if chosen >= 0:
+                row_agreed[r] = True
+                verdict[chosen] = _BOTH
+        if not _fade(side, verdict):
+            break
+        for n in range(len(z)):  # what is beside the end of a surface had no chance in its blur
+            allowed[n] &= verdict[n] != _FADING
     return verdict, row_agreed
+
+
+@njit(cache=True, nogil=True)
+def _fade(side: Candidates, verdict: Verdicts) -> bool:
+    """Reject what is believed at the ends of runs and less than half as bright, and what goes on from there.
+
+    Whether there was any.
+    """
+    rows, amplitude, z = len(side.start) - 1, side.measured[3], side.active_mm[2]
+    believed, n = np.empty(rows, np.int64), 0
+    for k in range(len(verdict)):
+        if verdict[k] <= _ALONE:
+            believed[n] = k
+            n += 1
+    usual, any_faded = np.empty(USUAL_ROWS), False
+    for step in (1, -1):
+        for i in range(n):
+            k = believed[i]
+            if 0 <= i - step < n and _goes_on(side, z, believed[i - step], k):
+                continue
+            inner = 0  # along the run, from its end
+            for j in range(1, FADED_ROWS + USUAL_ROWS + 1):
+                m = i + step * j
+                if not (0 <= m < n and _goes_on(side, z, believed[m - step], believed[m])):
+                    break
+                if j > FADED_ROWS:
+                    usual[inner] = amplitude[believed[m]]
+                    inner += 1
+            if inner < USUAL_ROWS:
+                continue
+            limit, end = 0.5 * median(usual, inner), believed[i]
+            for j in range(FADED_ROWS):
+                k = believed[i + step * j]
+                if amplitude[k] >= limit:
+                    break
+                verdict[k] = _FADING
+                any_faded = True
+            if verdict[end] != _FADING:
+                continue
+            for r in range(side.row[end] - step, side.row[end] - step * (FADED_ROWS + 1), -step):  # and further out
+                if not 0 <= r < rows:
+                    break
+                for m in range(side.start[r], side.start[r + 1]):
+                    if abs(z[m] - z[end]) < CONTINUITY_MM and amplitude[m] < limit:
+                        verdict[m] = _FADING
+    return any_faded
+
+
+@njit(cache=True, nogil=True)
+def _goes_on(side: Candidates, z: Values, one: int, other: int) -> bool:
+    """Whether two believed candidates are neighbours on one surface."""
+    gap = abs(side.row[other] - side.row[one])
+    return gap <= GAP_ROWS and abs(z[one] - z[other]) < CONTINUITY_MM + CONTINUITY_PER_ROW_MM * (gap - 1)
 
 
 @njit(cache=True, nogil=True)
@@ -203,6 +270,7 @@ def _believe(side: Candidates, alone: Flags, rival_dn: Values, run_rows: int, ve
         for n in range(len(alone)):
             if alone[n] and length[n] >= run_rows:
                 verdict[n] = _ALONE
+        _fade(side, verdict)
 
 
 @njit(cache=True, nogil=True)
@@ -278,7 +346,7 @@ def unexplained_px2(side: Candidates, verdict: Verdicts) -> float:
 
 @njit(cache=True, nogil=True)
 def count(verdict: Verdicts) -> Indices:
-    """How many candidates met each `Verdict`, (8,)."""
+    """How many candidates met each `Verdict`, (9,)."""
     out = np.zeros(VERDICTS, np.int64)
     for n in range(len(verdict)):
         out[verdict[n]] += 1

@@ -21,12 +21,12 @@ from echolume_processing.hybrid.rules.names import DEFAULT, DESCRIPTIONS
 
 SCENES = ("demo", "matte")
 FULL_SCENES = (
-    "demo", "matte", "glass-steep", "glass-small", PAPER, "glass-two", "glass-stair", "glass-hole", "glass-tilt-5",
+    "demo", "matte", "glass-steep", "glass-small", "glass-low", PAPER, "glass-two", "glass-stair", "glass-hole", "glass-tilt-5",
     "glass-tilt-10", "glass-tilt-20", "bottle", "mirror", "perforated", "smoke", "bright", "drift", "sphere",
     "nothing-shared",
 )  # fmt: skip
 """All shipped scenes but those that only calibrate, and the demo scene with the paper's array."""
-THRICE = ("demo", "matte", "glass-steep", "glass-small", PAPER)
+THRICE = ("demo", "matte", "glass-steep", "glass-small", "glass-low", PAPER)
 """Scenes that `--full` scans with three rigs: those that a figure with a bar is taken from."""
 COLUMNS = (
     "f1_1mm", "f1_1mm_nonedge", "rmse_mm", "f1_0p5mm_matte_nonedge", "black_f1_2mm", "glass_recall", "glass_precision",

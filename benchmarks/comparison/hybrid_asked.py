@@ -22,6 +22,8 @@ TARGETS: Mapping[str, tuple[float, float | None]] = {
     "rmse_mm_demo": (1.5, 0.4),
     "glass_recall": (0.95, 0.99),
     "glass_precision": (0.97, 0.995),
+    "glass_low_recall": (0.95, 0.99),
+    "glass_low_precision": (0.97, 0.995),
     "glass_recall_beam30": (0.75, 0.9),
     "glass_precision_beam30": (0.75, 0.9),
     "glass_height_mm": (0.2, 0.05),
@@ -42,6 +44,9 @@ TARGETS: Mapping[str, tuple[float, float | None]] = {
 }
 """What is asked at least, and the aim. NEES is asked between 0.8 and 1.25, the coverage between 92 and 98."""
 
+LOW = "glass-low"
+"""Glass of 2 to 10 mm above what light sees; the table asks for 10 mm, and aims at 2 mm."""
+
 FROM: Mapping[str, tuple[str, str, str]] = {
     "f1_1mm_demo": ("demo", DEFAULT, "f1_1mm"),
     "f1_1mm_demo_nonedge": ("demo", DEFAULT, "f1_1mm_nonedge"),
@@ -51,6 +56,8 @@ FROM: Mapping[str, tuple[str, str, str]] = {
     "rmse_mm_demo": ("demo", DEFAULT, "rmse_mm"),
     "glass_recall": ("demo", DEFAULT, "glass_recall"),
     "glass_precision": ("demo", DEFAULT, "glass_precision"),
+    "glass_low_recall": (LOW, DEFAULT, "glass_recall"),
+    "glass_low_precision": (LOW, DEFAULT, "glass_precision"),
     "glass_height_mm": ("demo", DEFAULT, "glass_height_mm"),
     "black_f1_2mm": ("demo", DEFAULT, "black_f1_2mm"),
     "false_transparent_pct": ("matte", DEFAULT, "transparent_pct"),

@@ -21,9 +21,9 @@ from echolume_processing.hybrid.rules.names import DEFAULT, DESCRIPTIONS
 
 SCENES = ("demo", "matte")
 FULL_SCENES = (
-    "demo", "matte", "glass-steep", "glass-small", "glass-low", PAPER, "glass-two", "glass-stair", "glass-hole", "glass-tilt-5",
-    "glass-tilt-10", "glass-tilt-20", "bottle", "mirror", "perforated", "smoke", "bright", "drift", "sphere",
-    "nothing-shared",
+    "demo", "matte", "glass-steep", "glass-small", "glass-low", PAPER, "glass-two", "glass-stair", "glass-hole",
+    "glass-tilt-5", "glass-tilt-10", "glass-tilt-20", "bottle", "mirror", "perforated", "smoke", "bright", "drift",
+    "sphere", "nothing-shared",
 )  # fmt: skip
 """All shipped scenes but those that only calibrate, and the demo scene with the paper's array."""
 THRICE = ("demo", "matte", "glass-steep", "glass-small", "glass-low", PAPER)

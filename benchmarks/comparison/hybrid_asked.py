@@ -22,7 +22,7 @@ TARGETS: Mapping[str, tuple[float, float | None]] = {
     "rmse_mm_demo": (1.5, 0.4),
     "glass_recall": (0.95, 0.99),
     "glass_precision": (0.97, 0.995),
-    "glass_low_recall": (0.95, 0.99),
+    "glass_low_mm": (10, 2),
     "glass_low_precision": (0.97, 0.995),
     "glass_recall_beam30": (0.75, 0.9),
     "glass_precision_beam30": (0.75, 0.9),
@@ -45,7 +45,10 @@ TARGETS: Mapping[str, tuple[float, float | None]] = {
 """What is asked at least, and the aim. NEES is asked between 0.8 and 1.25, the coverage between 92 and 98."""
 
 LOW = "glass-low"
-"""Glass of 2 to 10 mm above what light sees; the table asks for 10 mm, and aims at 2 mm."""
+LOW_MM = (10, 7, 4, 2)
+"""How high the glass of that scene stands above what light sees."""
+LOW_FOUND = 0.99
+"""Recall from which it counts as found."""
 
 FROM: Mapping[str, tuple[str, str, str]] = {
     "f1_1mm_demo": ("demo", DEFAULT, "f1_1mm"),
@@ -56,7 +59,6 @@ FROM: Mapping[str, tuple[str, str, str]] = {
     "rmse_mm_demo": ("demo", DEFAULT, "rmse_mm"),
     "glass_recall": ("demo", DEFAULT, "glass_recall"),
     "glass_precision": ("demo", DEFAULT, "glass_precision"),
-    "glass_low_recall": (LOW, DEFAULT, "glass_recall"),
     "glass_low_precision": (LOW, DEFAULT, "glass_precision"),
     "glass_height_mm": ("demo", DEFAULT, "glass_height_mm"),
     "black_f1_2mm": ("demo", DEFAULT, "black_f1_2mm"),
@@ -85,20 +87,21 @@ def headline(table: Table) -> Row:
         for key, (scene, rule, name) in FROM.items()
         if name in table.get(scene, {}).get(rule, {}) and np.isfinite(table[scene][rule][name])
     }
-    return taken | smallest_plate(table) | least_gain(table)
+    low = least_found(table, LOW, "low", LOW_MM, LOW_FOUND, "glass_low_mm")
+    return taken | least_found(table, SMALL, "plate", PLATES_MM, FOUND, "glass_small_mm") | low | least_gain(table)
 
 
-def smallest_plate(table: Table) -> Row:
-    """Side of the smallest plate that is found and all larger ones too; infinite if the largest is not."""
-    small = table.get(SMALL, {}).get(DEFAULT)
-    if small is None:
+def least_found(table: Table, scene: str, region: str, sizes_mm: Sequence[int], recall: float, key: str) -> Row:
+    """The least of some sizes of glass that is found and all larger ones too; infinite if the largest is not."""
+    rows = table.get(scene, {}).get(DEFAULT)
+    if rows is None:
         return {}
-    side_mm = float("inf")
-    for plate_mm in PLATES_MM:
-        if not small[f"plate_{plate_mm}_recall"] >= FOUND:
+    least_mm = float("inf")
+    for size_mm in sizes_mm:
+        if not rows[f"{region}_{size_mm}_recall"] >= recall:
             break
-        side_mm = float(plate_mm)
-    return {"glass_small_mm": side_mm}
+        least_mm = float(size_mm)
+    return {key: least_mm}
 
 
 def gains(table: Table) -> Row:

@@ -86,6 +86,17 @@ def test_the_nearest_place_stands_upright_below_its_point(
     assert np.linalg.norm(np.cross(normal, ray)) / np.linalg.norm(ray) < 1e-3
 
 
+@pytest.mark.parametrize("radius_mm", [12.0, 20.0, 30.0])
+@pytest.mark.parametrize("aside_mm", [60.0, 110.0, 160.0])
+def test_the_nearest_place_is_found_from_far_aside(radius_mm: float, aside_mm: float) -> None:
+    pipe = Plane(0.0, 0.0, 30.0, 0.0, 0.0, -1 / radius_mm)
+    ray = np.array([aside_mm, 150.0 - (30.0 - radius_mm)])
+    foot_mm = radius_mm * ray[0] / np.hypot(*ray)
+    (x, y) = pipe.mirror_points(np.array([[aside_mm, 7.0, 150.0]]))[0]
+    assert x == pytest.approx(foot_mm, abs=0.01)
+    assert y == pytest.approx(7.0, abs=1e-6)
+
+
 def test_a_plane_without_a_bend_is_the_plane_of_before() -> None:
     flat, centre = Plane(1.0, 2.0, 30.0, 0.1, -0.2), np.array([[10.0, -5.0, 150.0], [0.0, 40.0, 149.0]])
     nearly = Plane(1.0, 2.0, 30.0, 0.1, -0.2, -1e-12)
@@ -130,7 +141,9 @@ def test_an_arc_is_part_of_a_circle(slope: float, bend: float, along_mm: float) 
     middle = np.array([-slope * cosine * radius_mm, cosine * radius_mm])
     here = np.array([along_mm, height_mm]) - middle
     if abs(slope * cosine + along_mm / radius_mm) < STEEPEST_SINE:
+        exact_mm = middle[1] - np.sign(bend) * np.sqrt(radius_mm**2 - (along_mm - middle[0]) ** 2)
         assert np.hypot(*here) == pytest.approx(abs(radius_mm), rel=1e-6)
+        assert height_mm == pytest.approx(exact_mm, abs=1e-6 + 1e-13 * radius_mm**2)
         assert here[0] + here[1] * steep == pytest.approx(0, abs=1e-5 * abs(radius_mm))
         assert np.sign(bent) == np.sign(bend)
     else:

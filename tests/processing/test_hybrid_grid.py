@@ -56,7 +56,7 @@ def test_points_outside_the_field_and_points_without_a_height_are_left_out() -> 
     assert grid.count.sum() == 0
 
 
-def test_one_absurd_height_leaves_the_other_cells_as_they_are() -> None:
+def test_one_absurd_height_spoils_no_other_cell() -> None:
     rng = np.random.default_rng(4)
     rows = [(x, y, z, OpticalSource.STEREO) for x, y, z in zip(*rng.uniform(0, 3, (3, 60)), strict=True)]
     one = accumulate(optical(rows), FIELD)
@@ -101,6 +101,29 @@ def test_a_balls_flank_is_at_its_own_height() -> None:
     off_mm = np.abs(grid.height_mm - ball(*(m.clip(0.2, 19.8) for m in MIDDLES)))[inside]
     assert off_mm.max() < 0.12
     assert np.median(off_mm) < 0.02
+
+
+@pytest.mark.parametrize("rise_mm", [2.3, 20.0])
+def test_a_step_beside_a_shadow_is_no_slope(rise_mm: float) -> None:
+    points = stripes(lambda x, y: np.where(x < 8, 5.0, 5.0 + rise_mm), 0.1)
+    points = points[(points["x_mm"] < 9) | (points["x_mm"] > 13)]
+    height_mm = accumulate(points, SQUARE).height_mm
+    np.testing.assert_allclose(height_mm[:, :8], 5.0, atol=1e-6)
+    np.testing.assert_allclose(height_mm[:, 8], 5.0 + rise_mm, atol=1e-6)
+
+
+def test_a_flank_beside_a_shadow_goes_on() -> None:
+    points = stripes(lambda x, y: 2.0 * x, 0.1)
+    height_mm = accumulate(points[points["x_mm"] < 9], SQUARE).height_mm
+    np.testing.assert_allclose(height_mm[:, :9], 2.0 * MIDDLES[0][:, :9], atol=2e-3)
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(1, 4), (4, 1), (1, 1)])
+def test_a_field_may_be_one_cell_wide(columns: int, rows: int) -> None:
+    field = MapField(x_mm=(0.0, columns), y_mm=(0.0, rows), cell_mm=1.0)
+    points = optical([(0.1, 0.2, 5.0, OpticalSource.STEREO)])
+    assert accumulate(points, field).height_mm.ravel()[0] == 5.0
+    assert np.isnan(accumulate(points[:0], field).height_mm).all()
 
 
 def test_stereo_points_do_not_count_beside_the_active_ones_that_they_are_made_of() -> None:

@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 STEEPEST_SINE = 0.98
 """Where the arc is as steep as this it goes on straight, so that there is a height everywhere."""
 
+STEEP_SINE = 0.9
+"""Up to here Newton finds the way to the nearest place from."""
+
 Values = NDArray[np.float64]
 
 
@@ -25,7 +28,8 @@ class Arc:
         cosine_here = 1.0 / np.hypot(1.0, self.slope)
         sine_here, per_mm = self.slope * cosine_here, self.bend * cosine_here**3
         whole = sine_here + along_mm * per_mm
-        sine = np.clip(whole, -STEEPEST_SINE, STEEPEST_SINE)  # of the angle that the surface has there
+        low, high = min(-STEEPEST_SINE, sine_here), max(STEEPEST_SINE, sine_here)
+        sine = np.clip(whole, low, high)  # of the angle that the surface has there
         beyond = sine != whole
         arc_mm = along_mm.copy()
         arc_mm[beyond] = (sine[beyond] - sine_here) / per_mm if per_mm else 0.0
@@ -33,3 +37,12 @@ class Arc:
         slope = sine / cosine
         height_mm = arc_mm * (sine + sine_here) / (cosine + cosine_here) + (along_mm - arc_mm) * slope
         return height_mm, slope, np.where(beyond, 0.0, per_mm / cosine**3)
+
+    def short_of(self, along_mm: Values) -> Values:
+        """The same places, drawn to where the arc is not as steep as `STEEP_SINE`."""
+        cosine_here = 1.0 / np.hypot(1.0, self.slope)
+        per_mm = self.bend * cosine_here**3
+        if per_mm == 0.0:
+            return along_mm
+        ends_mm = (np.array([-STEEP_SINE, STEEP_SINE]) - self.slope * cosine_here) / per_mm
+        return np.clip(along_mm, ends_mm.min(), ends_mm.max())

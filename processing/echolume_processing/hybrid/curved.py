@@ -94,7 +94,7 @@ def _ways(plane: Plane, centre_mm: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _fitted(plane: Plane, centre_mm: NDArray[np.float64], way_mm: NDArray[np.float64]) -> Plane:
-    """One step of Gauss and Newton."""
+    """One step of Gauss and Newton; the derivatives are a parabola's, near enough where pings meet a surface."""
     x, y = plane.mirror_points(centre_mm).T
     off_mm = np.linalg.norm(centre_mm - np.column_stack((x, y, plane.at(x, y))), axis=1) - way_mm
     upright = 1 / np.sqrt(1 + sum(s * s for s in plane.slope_at(x, y)))

@@ -90,8 +90,8 @@ def gather(points: Structured, field: MapField, triggers: Triggers | None = None
     Points are sorted by cell and height in whole micrometres before anything is counted, so any order of
     arrival gives the same bits. A cell that straddles a step gives the height of its majority. The standard
     deviation of a cell is that of its median: 1.2533 times the larger of the robust spread and the points' own
-    sigma, over the root of their number; a stereo point, which is made of the same two image points as the active ones
-    of its row, does not count beside them.
+    sigma, over the root of their number. A stereo point is made of the same two image points as the active ones of its
+    row: stereo points count if there are more of them than active ones, and else those.
     """
     rows, columns = field.shape
     height_mm = np.full(rows * columns, np.nan)
@@ -140,8 +140,8 @@ def centred(gathered: Gathered) -> OpticalGrid:
     -----
     A stripe crosses a column of cells at one place, which is off the middle by up to half a cell. The slope is that
     between neighbouring cells: the harmonic mean of those to either side (van Leer, doi:10.1016/0021-9991(74)90019-9),
-    which is 0 on a crest and where one side is level, as at a step; where a neighbour is missing, that to the other
-    one. Slopes beyond `STEEPEST` are steps, those below `GENTLEST` noise.
+    which is 0 on a crest and where one side is level, as at a step; where a neighbour is missing, that of the two next
+    slopes on the other side. Slopes beyond `STEEPEST` are steps, those below `GENTLEST` noise.
     """
     grid = gathered.grid
     height_mm = grid.height_mm.copy()
@@ -149,16 +149,20 @@ def centred(gathered: Gathered) -> OpticalGrid:
         place_mm = gathered.aside_mm[axis]
         rise_mm = np.diff(grid.height_mm, axis=along)
         run_mm = np.maximum(grid.field.cell_mm + np.diff(place_mm, axis=along), LEAST_RUN * grid.field.cell_mm)
-        missing = np.full_like(rise_mm.take([0], axis=along), np.nan)
-        slope = rise_mm / run_mm
-        before, after = (np.concatenate(pair, axis=along) for pair in ((missing, slope), (slope, missing)))
-        height_mm -= _limited(before, after) * place_mm
+        beside = [(2, 2) if each == along else (0, 0) for each in (0, 1)]
+        padded = np.pad(rise_mm / run_mm, beside, constant_values=np.nan)
+        cells = height_mm.shape[along]
+        further_before, before, after, further_after = (
+            padded.take(range(k, k + cells), axis=along) for k in range(4)
+        )  # fmt: skip
+        slope = np.where(np.isnan(after), _limited(further_before, before), _limited(before, after))
+        slope = np.where(np.isnan(before), _limited(after, further_after), slope)
+        height_mm -= slope * place_mm
     return replace(grid, height_mm=height_mm)
 
 
-def _limited(before: NDArray[np.float64], after: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Slope of cells between those to either side."""
-    one, other = np.where(np.isfinite(before), before, after), np.where(np.isfinite(after), after, before)
+def _limited(one: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Harmonic mean of slopes that have one sign and are neither noise nor a step; else 0."""
     same = one * other > 0
     mean = np.divide(2 * one * other, one + other, out=np.zeros_like(one), where=same)
     return np.where((np.abs(mean) >= GENTLEST) & (np.abs(mean) <= STEEPEST), mean, 0.0)

@@ -74,7 +74,7 @@ class Heard:
         return Heard(
             arm_mm @ about_emitter.T + emitter_mm @ about_rig.T + value[[3, 4, 0]],
             self.normal @ about_emitter.T,
-            self.path_mm * longer,
+            self.path_mm * longer[: len(self.path_mm)],
         )
 
 

@@ -26,7 +26,7 @@ class LightCells:
 
     @property
     def grid(self) -> OpticalGrid:
-        """Of all stripes so far; its images may change with the next stripe."""
+        """Of all stripes so far; good until the next stripe, which changes some of its images."""
         if self._stripes is None:
             self._stripes = self._witnesses()
         return replace(centred(self._gathered), stripes=self._stripes)

@@ -60,11 +60,8 @@ def _plane_variance(points: Values, plane_mm2: Values) -> Values:
     out = np.empty(points.shape[1])
     for i in range(len(out)):
         y, z = points[1, i], points[2, i]
-        out[i] = (
-            plane_mm2[0]
-            + y * (plane_mm2[1] + y * plane_mm2[3] + z * plane_mm2[4])
-            + z * (plane_mm2[2] + z * plane_mm2[5])
-        )
+        variance = plane_mm2[0] + y * (plane_mm2[1] + y * plane_mm2[3] + z * plane_mm2[4])
+        out[i] = max(variance + z * (plane_mm2[2] + z * plane_mm2[5]), 0.0)
     return out
 
 
@@ -89,13 +86,17 @@ def _along_ray(point: Values, centre: Values, plane: Values, shift_mm: float, ou
 
 
 @njit(cache=True, nogil=True)
-def _camera_mm(left: View, right: View, terms: Terms, middle: Values) -> float:
-    """What the errors of both cameras' models do to the place of the stripe as they see it together."""
+def _camera_mm(left: View, right: View, terms: Terms, middle: Values, per_mm: float) -> float:
+    """What the errors of both cameras' models do to the place of the plane as they see it together.
+
+    A column's error moves a point along the plane, which its ray meets aslant; `per_mm` is what agreement calls the
+    amplification.
+    """
     total = 0.0
     for view, sigma_px in ((left, terms.left_px), (right, terms.right_px)):
-        away_mm = np.sqrt(((middle - view.centre_mm) ** 2).sum())
-        total += (0.5 * sigma_px * away_mm / view.lens[0]) ** 2
-    return np.sqrt(total)
+        ray = middle - view.centre_mm
+        total += (sigma_px * (ray * ray).sum() / (view.lens[0] * (ray * terms.normal).sum())) ** 2
+    return np.sqrt(total) / abs(per_mm)
 
 
 @njit(cache=True, nogil=True)
@@ -187,8 +188,9 @@ def run(
     shift_mm = 0.0
     if n >= agreement.FEW_POINTS:
         middle = np.array([active[0].mean(), active[1].mean(), active[2].mean()])
+        camera_mm = _camera_mm(left, right, terms, middle, agreed[3])
         shift_mm, plane_mm2 = plane_shift.shift(
-            n, agreed[1], agreed[3], agreed[4], middle[1], middle[2], _camera_mm(left, right, terms, middle), plane_mm2
+            n, agreed[1], agreed[3], agreed[4], middle[1], middle[2], camera_mm, plane_mm2
         )
     joint, joint_covariance = np.empty((3, n)), np.empty((6, n))
     variance = _plane_variance(points, plane_mm2)

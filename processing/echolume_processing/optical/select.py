@@ -65,6 +65,8 @@ BRIGHTER = 1e5
 """A row more counts more than any amplitude."""
 FADED_ROWS = 4
 """The blur reaches no further beyond the end of a surface."""
+FALLS = 0.8
+"""And falls by more from row to row; a darker rim does not."""
 USUAL_ROWS = 6
 """So many rows further in tell how bright a run is; at its very end it is half as bright."""
 FEW = 20
@@ -145,7 +147,21 @@ def _agree(side: Candidates, match: Match) -> tuple[Verdicts, Flags]:
             break
         for n in range(len(z)):  # what is beside the end of a surface had no chance in its blur
             allowed[n] &= verdict[n] != _FADING
+    row_agreed[:] = False
+    for n in range(len(z)):
+        row_agreed[side.row[n]] |= verdict[n] == _BOTH
     return verdict, row_agreed
+
+
+@njit(cache=True, nogil=True)
+def _beyond_dn(side: Candidates, one: int, step: int) -> float:
+    """How bright the same surface is on the next row, believed or not; 0 if nothing is there."""
+    brightest, r = 0.0, side.row[one] + step
+    if 0 <= r < len(side.start) - 1:
+        for m in range(side.start[r], side.start[r + 1]):
+            if abs(side.active_mm[2, m] - side.active_mm[2, one]) < CONTINUITY_MM:
+                brightest = max(brightest, side.measured[3, m])
+    return brightest
 
 
 @njit(cache=True, nogil=True)
@@ -179,7 +195,7 @@ def _fade(side: Candidates, verdict: Verdicts) -> bool:
             limit, end = 0.5 * median(usual, inner), believed[i]
             for j in range(FADED_ROWS):
                 k = believed[i + step * j]
-                if amplitude[k] >= limit:
+                if amplitude[k] >= limit or _beyond_dn(side, k, -step) > FALLS * amplitude[k]:
                     break
                 verdict[k] = _FADING
                 any_faded = True
@@ -189,7 +205,7 @@ def _fade(side: Candidates, verdict: Verdicts) -> bool:
                 if not 0 <= r < rows:
                     break
                 for m in range(side.start[r], side.start[r + 1]):
-                    if abs(z[m] - z[end]) < CONTINUITY_MM and amplitude[m] < limit:
+                    if verdict[m] > _ALONE and abs(z[m] - z[end]) < CONTINUITY_MM and amplitude[m] < limit:
                         verdict[m] = _FADING
     return any_faded
 

@@ -8,7 +8,7 @@ SYNTHESIS = "synthesis"
 DEFAULT = SYNTHESIS
 
 DESCRIPTIONS: Mapping[str, str] = {
-    "optical": "light alone: the median of a cell's optical points",
+    "optical": "light alone: the height of a cell's optical points at its centre",
     "ultrasonic": "sound alone: the nearest contact point within 20 mm that stands over what it hears",
     "union": "the paper's hybrid image: the mean of all points in a cell, whichever sense they come from",
     "inverse-variance": "light and the nearest contact point, weighted by their stated variances",

@@ -107,7 +107,7 @@ def lower_ground(
     cells
         Row and column of each cell of the hole, shape (n, 2).
     nearest
-        Its distance to the nearest rim cell, shape (n,).
+        Its distance to the nearest rim cell, in cells, shape (n,).
     looked, across
         The rim is looked at within twice that distance and `looked`, and at least within `across`.
     rim, rim_mm

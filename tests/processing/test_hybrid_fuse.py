@@ -11,7 +11,7 @@ from echolume_drivers.emulated import scene_file
 from echolume_drivers.emulated.scene import Material, SceneBuilder
 from echolume_messages.calibration import Calibration
 from echolume_messages.types import NO_TRIGGER, OPTICAL_POINT, Label, Provenance
-from echolume_processing.hybrid import kernels, surface, tile_kernels
+from echolume_processing.hybrid import cell_kernels, kernels, surface, tile_kernels
 from echolume_processing.hybrid.digest import digest
 from echolume_processing.hybrid.fuse import fuse
 from echolume_processing.hybrid.model import HybridMap
@@ -229,5 +229,8 @@ def test_the_warm_up_compiles_what_fusing_uses(found: HybridMap) -> None:
         surface._horizons,
         tile_kernels.tile_spectra,
         tile_kernels.solve_box,
+        cell_kernels.occupied,
+        cell_kernels.twice_medians,
+        cell_kernels.lower_ground,
     ):
         assert len(kernel.signatures) == 1, f"{kernel.__name__}: fusing and warm-up call it with other types"

@@ -141,6 +141,48 @@ def test_no_points_make_an_empty_grid() -> None:
     assert np.isnan(accumulate(np.zeros(0, dtype=OPTICAL_POINT), FIELD).height_mm).all()
 
 
+HEIGHTS_MM = {
+    "scattered": np.linspace(-30, 30, 977),
+    "tied": np.array([0.0, 0.5, 0.5, 1.0]),
+    "absurd": np.array([0.0, 1.0, 4e15, -4e15, 9e9, -1e12, np.nan, np.inf]),
+}
+
+
+def median_of(values: list[int]) -> float:
+    """Of whole numbers as numpy's 64 bits hold them: too large ones wrap around."""
+    ordered = np.sort(np.array(values, dtype=np.int64))
+    return 0.5 * float(ordered[(ordered.size - 1) // 2] + ordered[ordered.size // 2])
+
+
+@pytest.mark.parametrize("kind", HEIGHTS_MM)
+@pytest.mark.parametrize("number", [1, 2, 30, 5000])
+def test_every_cell_has_what_its_points_say_one_cell_at_a_time(kind: str, number: int) -> None:
+    rng = np.random.default_rng(number)
+    points = np.zeros(number, dtype=OPTICAL_POINT)
+    points["x_mm"], points["y_mm"] = rng.uniform(0, 4, number), rng.uniform(0, 3, number)
+    points["z_mm"], points["sigma_z_mm"] = rng.choice(HEIGHTS_MM[kind], number), rng.uniform(0, 0.3, number)
+    points["source"] = rng.integers(1, 4, number)
+    made = gather(points, FIELD)
+    grid = made.grid
+    for j, i in np.ndindex(FIELD.shape):
+        there = points[(points["y_mm"] // 1 == j) & (points["x_mm"] // 1 == i) & np.isfinite(points["z_mm"])]
+        assert grid.count[j, i] == there.size
+        if not there.size:
+            assert np.isnan([grid.height_mm[j, i], grid.sigma_mm[j, i]]).all()
+            assert not made.aside_mm[:, j, i].any()
+            continue
+        steps, own = (np.rint(there[name] * np.float64(1000)).astype(np.int64) for name in ("z_mm", "sigma_z_mm"))
+        median = median_of(steps.tolist())
+        off = 0.5 * median_of(np.abs(2 * steps - np.int64(2 * median)).tolist())
+        stereo = int((there["source"] == OpticalSource.STEREO).sum())
+        spread_mm = max(off * 1.4826 / 1000, median_of(own.tolist()) / 1000)
+        assert grid.height_mm[j, i] == median / 1000
+        assert grid.sigma_mm[j, i] == max(0.01, 1.2533 * spread_mm / np.sqrt(max(stereo, there.size - stereo)))
+        for axis, (name, middle_mm) in enumerate((("x_mm", i + 0.5), ("y_mm", j + 0.5))):
+            total = np.rint(there[name] * np.float64(1000)).sum()
+            assert made.aside_mm[axis, j, i] == total / (there.size * 1000) - middle_mm
+
+
 @settings(max_examples=40, deadline=None)
 @given(st.data())
 def test_the_order_of_arrival_does_not_change_a_bit(data: st.DataObject) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
+from scipy import ndimage
 
 from echolume_messages.plan import MapField
 from echolume_processing.hybrid.grid import OpticalGrid
@@ -91,3 +93,38 @@ def test_beside_a_steep_flank_nothing_is_guessed() -> None:
     assert not closed.occluded[:, 10:14].any()
     height_mm[:, 14:46] = 20.0
     assert close(grid_of(height_mm)).occluded[:, 10:14].all()
+
+
+def filled(height_mm: np.ndarray, seen: np.ndarray, holes: np.ndarray, wide: np.ndarray) -> np.ndarray:
+    """Every hole's cells one by one, each against all of the hole's rim."""
+    out = np.where(seen, height_mm, 0.0)
+    labels, number = ndimage.label(holes, np.ones((3, 3)))
+    for k in range(1, number + 1):
+        inside = labels == k
+        rim = np.argwhere(ndimage.binary_dilation(inside, np.ones((3, 3))) & seen)
+        if not rim.size:
+            continue
+        depth = ndimage.distance_transform_edt(np.pad(inside, 1)).max()
+        looked = 25.0 if (wide & inside).any() else 3.0
+        for j, i in np.argwhere(inside):
+            away2 = ((rim - (j, i)) ** 2).sum(axis=1)
+            near = away2 <= max(2 * np.sqrt(away2.min()) + looked, 2 * depth + 3.0) ** 2
+            heights_mm = height_mm[rim[:, 0], rim[:, 1]]
+            low = near & (heights_mm <= heights_mm[near].min() + 1.0)
+            out[j, i] = heights_mm[np.argmin(np.where(low, away2, np.inf))]
+    return out
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_each_cell_of_a_hole_gets_the_nearest_of_the_low_rim_cells(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    height_mm = np.round(rng.normal(0, 1.5, FIELD.shape)) + np.where(np.arange(60) < 30, 0.0, 12.0)
+    for _ in range(6):
+        (j, i), (rows, columns) = rng.integers(0, (50, 60)), rng.integers(1, 18, 2)
+        height_mm[j : j + rows, i : i + columns] = np.nan
+    height_mm[rng.random(FIELD.shape) < 0.02 * seed] = np.nan
+    closed = close(grid_of(height_mm))
+    holes = ~closed.seen & ~closed.outside
+    wide = np.any([np.zeros(FIELD.shape, dtype=np.bool_), *closed.absorbing], axis=0)
+    assert holes.any()
+    np.testing.assert_array_equal(closed.height_mm, filled(height_mm, closed.seen, holes, wide))

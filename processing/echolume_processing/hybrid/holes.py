@@ -8,8 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from echolume_processing.hybrid.cell_kernels import lower_ground
 from echolume_processing.hybrid.grid import OpticalGrid
-from echolume_processing.hybrid.scipy_typed import EIGHT, Mask, NearestPoints, depth_inside, dilated, labelled, opened
+from echolume_processing.hybrid.scipy_typed import (
+    EIGHT,
+    Mask,
+    NearestPoints,
+    around_each,
+    depth_inside,
+    dilated,
+    labelled,
+    opened,
+)
 
 LEAST_POINTS = 2
 LEAST_NEIGHBOURS = 3
@@ -119,21 +129,14 @@ def _swept(seen: Mask) -> Mask:
 def _fill_from_lower(height_mm: NDArray[np.float64], seen: Mask, holes: Mask, wide: Mask) -> None:
     """Give each hole cell the height of the nearest seen rim cell among the low ones around it."""
     labels, number = labelled(holes)
-    for k in range(1, number + 1):
-        j, i = np.nonzero(labels == k)
-        around = (slice(max(0, j.min() - 1), j.max() + 2), slice(max(0, i.min() - 1), i.max() + 2))
+    for k, around in zip(range(1, number + 1), around_each(labels), strict=True):
         inside = labels[around] == k
         rim = dilated(inside) & seen[around]
         if not rim.any():
             continue
-        cells, rim_cells = np.argwhere(inside), np.argwhere(rim)
+        cells, rim_cells = (np.ascontiguousarray(np.argwhere(mask)) for mask in (inside, rim))
         view, looked = height_mm[around], LOOKED_WIDE_CELLS if wide[around][inside].any() else LOOKED_CELLS
         across = 2 * float(depth_inside(inside).max()) + LOOKED_CELLS
-        rim_mm = view[rim]
-        known = NearestPoints(rim_cells.astype(np.float64))
-        nearest, _ = known.nearest(cells.astype(np.float64))
-        for cell, distance in zip(cells, nearest, strict=True):
-            near = known.around(cell.astype(np.float64), max(2 * float(distance) + looked, across))
-            low = near[rim_mm[near] <= rim_mm[near].min() + 1.0]
-            away = ((rim_cells[low] - cell) ** 2).sum(axis=1)
-            view[cell[0], cell[1]] = rim_mm[low[int(np.argmin(away))]]
+        nearest, _ = NearestPoints(rim_cells.astype(np.float64)).nearest(cells.astype(np.float64))
+        row_start = np.searchsorted(rim_cells[:, 0], np.arange(rim.shape[0] + 1))
+        view[inside] = lower_ground(cells, nearest, looked, across, rim_cells, view[rim], row_start)

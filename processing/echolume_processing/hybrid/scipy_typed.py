@@ -40,6 +40,16 @@ def labelled(mask: Mask) -> tuple[NDArray[np.int32], int]:
     return labels, number
 
 
+def around_each(labels: NDArray[np.int32]) -> list[tuple[slice, slice]]:
+    """Where each of the pieces of `labelled` lies in the image, with one cell all around it."""
+    found = cast("list[tuple[slice, slice]]", ndimage.find_objects(labels))
+    return [(_wider(rows), _wider(columns)) for rows, columns in found]
+
+
+def _wider(part: slice) -> slice:
+    return slice(max(0, part.start - 1), part.stop + 1)
+
+
 def opened(mask: Mask, square: int) -> Mask:
     """What a square of so many cells fits into; the border is continued, or a hole at the rim would be eaten."""
     padded = np.pad(mask, square, mode="edge")

@@ -116,7 +116,7 @@ def sound_image(
     if not found.any():
         return SoundImage(height_mm, stated_mm, stated_mm, ping)
     nearest = index[found]
-    height_mm[found] = carried_mm(points[nearest], *(axis[found] for axis in np.meshgrid(*cell_centres_mm(field))))
+    height_mm[found] = carried_mm(points.take(nearest), *(axis[found] for axis in np.meshgrid(*cell_centres_mm(field))))
     unexplained_mm = DOUBTFUL_MM if narrow(array) else late_mm(array)
     stated_mm[found] = np.hypot(sigma_of(points, unexplained_mm), CLEAN_MM)[nearest]
     sigma_mm = np.sqrt(stated_mm**2 + rim_mm2(height_mm, away_mm, field.cell_mm))

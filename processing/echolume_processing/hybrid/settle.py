@@ -21,6 +21,10 @@ STEP_MM = 0.3
 """Step of the parabola through three heights."""
 STEP_TILT = 0.006
 """Step of the parabola through three slopes."""
+STEP_BEND_PER_MM = 0.001
+"""Step of the parabola through three bends."""
+BENT_STEPS = (4.0, 2.0, 1.0)
+"""A bent surface is refined so many times, in steps so many times those: its first fit is a coarse one."""
 LEVEL_FIRST = 0.95
 """A tilted plane must explain so much better than a level one."""
 NARROW = 0.3
@@ -74,7 +78,9 @@ def settle(
     if narrow:
         return _of_whole_waves(state, mask, plane, cost)
     plane = _parabola(plane, cost, Plane.raised, STEP_MM)[0]
-    if turns and not (plane.level or plane.bent):
+    if turns and plane.bent:
+        return _bent_to_fit(plane, cost), False
+    if turns and not plane.level:
         plane = _about_middle(plane, state, mask)
         for turn in (_turned_x, _turned_y):
             plane = _parabola(plane, cost, turn, STEP_TILT)[0]
@@ -98,6 +104,25 @@ def _of_whole_waves(state: State, mask: Mask, plane: Plane, cost: Cost) -> tuple
     more = np.delete(left, best, axis=0) - left[best]
     error = more.std(axis=1) / np.sqrt(near.size)
     return rivals[best], bool((more.mean(axis=1) < SURE * error).any())
+
+
+def _bent_to_fit(plane: Plane, cost: Cost) -> Plane:
+    """A bent surface with its slopes, bends and height by what they leave over, in steps that become smaller."""
+    for times in BENT_STEPS:
+        for turn in (_turned_x, _turned_y):
+            plane = _parabola(plane, cost, turn, times * STEP_TILT)[0]
+        for bend in (_bent_xx, _bent_yy):
+            plane = _parabola(plane, cost, bend, times * STEP_BEND_PER_MM)[0]
+        plane = _parabola(plane, cost, Plane.raised, STEP_MM)[0]
+    return plane
+
+
+def _bent_xx(plane: Plane, by_per_mm: float) -> Plane:
+    return replace(plane, bend_xx=plane.bend_xx + by_per_mm)
+
+
+def _bent_yy(plane: Plane, by_per_mm: float) -> Plane:
+    return replace(plane, bend_yy=plane.bend_yy + by_per_mm)
 
 
 def _about_middle(plane: Plane, state: State, mask: Mask) -> Plane:

@@ -25,8 +25,7 @@ class Arc:
 
     def at(self, along_mm: Values) -> tuple[Values, Values, Values]:
         """Height (mm), slope and second derivative (1/mm) so far along."""
-        cosine_here = 1.0 / np.hypot(1.0, self.slope)
-        sine_here, per_mm = self.slope * cosine_here, self.bend * cosine_here**3
+        cosine_here, sine_here, per_mm = self._here()
         whole = sine_here + along_mm * per_mm
         low, high = min(-STEEPEST_SINE, sine_here), max(STEEPEST_SINE, sine_here)
         sine = np.clip(whole, low, high)  # of the angle that the surface has there
@@ -40,9 +39,13 @@ class Arc:
 
     def short_of(self, along_mm: Values) -> Values:
         """The same places, drawn to where the arc is not as steep as `STEEP_SINE`."""
-        cosine_here = 1.0 / np.hypot(1.0, self.slope)
-        per_mm = self.bend * cosine_here**3
+        _, sine_here, per_mm = self._here()
         if per_mm == 0.0:
             return along_mm
-        ends_mm = (np.array([-STEEP_SINE, STEEP_SINE]) - self.slope * cosine_here) / per_mm
+        ends_mm = (np.array([-STEEP_SINE, STEEP_SINE]) - sine_here) / per_mm
         return np.clip(along_mm, ends_mm.min(), ends_mm.max())
+
+    def _here(self) -> tuple[float, float, float]:
+        """Cosine and sine of the arc's angle at 0, and its curvature (1/mm)."""
+        cosine = float(1.0 / np.hypot(1.0, self.slope))
+        return cosine, self.slope * cosine, self.bend * cosine**3

@@ -87,12 +87,13 @@ def close(grid: OpticalGrid) -> Closed:
 def _untold(grid: OpticalGrid, seen: Mask, narrow: Mask) -> Mask:
     """Small holes of which nothing tells whether they are pits or dark spots, and flanks too steep for light."""
     labels, _ = labelled(narrow)
+    places = around_each(labels)
     fall_mm = _fall(np.where(seen, grid.height_mm, np.nan))
     out = np.zeros_like(narrow)
     for k in np.unique(labels[opened(narrow, PIT_CELLS)]):
-        j, i = np.nonzero(labels == k)
-        around = (slice(max(0, j.min() - 1), j.max() + 2), slice(max(0, i.min() - 1), i.max() + 2))
+        around = places[k - 1]
         inside = labels[around] == k
+        j, i = np.nonzero(inside)
         rim = dilated(inside) & seen[around]
         if not rim.any():
             continue

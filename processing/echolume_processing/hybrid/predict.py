@@ -29,10 +29,6 @@ class Aperture:
     elements_mm: NDArray[np.float64]
     axis: NDArray[np.float64]
 
-    def moved(self, dz_mm: float) -> Aperture:
-        """The same aperture, higher by `dz_mm`."""
-        return Aperture(self.elements_mm + np.array([0.0, 0.0, dz_mm]), self.axis)
-
 
 def aperture(calibration: ArrayCalibration, robot_pose: NDArray[np.float64]) -> Aperture:
     """The calibrated array at a pose of the robot (6,)."""

@@ -49,10 +49,9 @@ def shift(
     The guide's error moves the plane as a whole. Both cameras see the same stripe on it, so the shift that makes
     AT-left and AT-right agree is one measurement of that, weighed against the calibration by Kalman's gain. The
     noise of neighbouring rows is the same speckle, so that only every `LAG_ROWS` of them counts, or every one that the
-    median takes if those are further apart. Tilts are known better
-    for it, but not moved. A shift that neither calibration nor noise explains may be a camera's error as well: what
-    exceeds `EXPLAINED` sigmas stays in the variance. Errors of the cameras are in the stereo points and in the shift;
-    that they go together there is left out.
+    median takes if those are further apart. Tilts are known better for it, but not moved. A shift that neither
+    calibration nor noise explains may be a camera's error as well: what exceeds `EXPLAINED` sigmas stays in the
+    variance. Errors of the cameras are in the stereo points and in the shift; that they go together is left out.
     """
     if count < FEW_POINTS or per_mm == 0.0:
         return 0.0, plane_mm2

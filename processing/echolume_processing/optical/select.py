@@ -128,11 +128,9 @@ def _agree(side: Candidates, match: Match) -> tuple[Verdicts, Flags]:
     for n in range(len(z)):
         verdict[n] = _OUTSIDE if np.isnan(z[n]) else _SHORT
         allowed[n] = match.partner[n] >= 0 and abs(off[n] - middle) < limit
-    row_agreed = np.zeros(len(side.start) - 1, np.bool_)
     for _ in range(2):
         length = _run_rows(side.start, side.row, z, allowed)
-        row_agreed[:] = False
-        for r in range(len(row_agreed)):
+        for r in range(len(side.start) - 1):
             best, chosen = 0.0, -1
             for n in range(side.start[r], side.start[r + 1]):
                 if verdict[n] == _BOTH:
@@ -141,13 +139,12 @@ def _agree(side: Candidates, match: Match) -> tuple[Verdicts, Flags]:
                 if length[n] >= LEAST_AGREED_ROWS and score > best:
                     best, chosen = score, n
             if chosen >= 0:
-                row_agreed[r] = True
                 verdict[chosen] = _BOTH
         if not _fade(side, verdict):
             break
         for n in range(len(z)):  # what is beside the end of a surface had no chance in its blur
             allowed[n] &= verdict[n] != _FADING
-    row_agreed[:] = False
+    row_agreed = np.zeros(len(side.start) - 1, np.bool_)
     for n in range(len(z)):
         row_agreed[side.row[n]] |= verdict[n] == _BOTH
     return verdict, row_agreed
@@ -176,23 +173,15 @@ def _fade(side: Candidates, verdict: Verdicts) -> bool:
         if verdict[k] <= _ALONE:
             believed[n] = k
             n += 1
-    usual, any_faded = np.empty(USUAL_ROWS), False
+    any_faded = False
     for step in (1, -1):
         for i in range(n):
             k = believed[i]
             if 0 <= i - step < n and _goes_on(side, z, believed[i - step], k):
                 continue
-            inner = 0  # along the run, from its end
-            for j in range(1, FADED_ROWS + USUAL_ROWS + 1):
-                m = i + step * j
-                if not (0 <= m < n and _goes_on(side, z, believed[m - step], believed[m])):
-                    break
-                if j > FADED_ROWS:
-                    usual[inner] = amplitude[believed[m]]
-                    inner += 1
-            if inner < USUAL_ROWS:
+            limit, end = 0.5 * _usual_dn(side, believed[:n], i, step), believed[i]
+            if np.isnan(limit):
                 continue
-            limit, end = 0.5 * median(usual, inner), believed[i]
             for j in range(FADED_ROWS):
                 k = believed[i + step * j]
                 if amplitude[k] >= limit or _beyond_dn(side, k, -step) > FALLS * amplitude[k]:
@@ -208,6 +197,19 @@ def _fade(side: Candidates, verdict: Verdicts) -> bool:
                     if verdict[m] > _ALONE and abs(z[m] - z[end]) < CONTINUITY_MM and amplitude[m] < limit:
                         verdict[m] = _FADING
     return any_faded
+
+
+@njit(cache=True, nogil=True)
+def _usual_dn(side: Candidates, believed: Indices, end: int, step: int) -> float:
+    """How bright a run is further in than blur reaches from its end; nan if it is too short to tell."""
+    usual = np.empty(USUAL_ROWS)
+    for j in range(1, FADED_ROWS + USUAL_ROWS + 1):
+        m = end + step * j
+        if not (0 <= m < len(believed) and _goes_on(side, side.active_mm[2], believed[m - step], believed[m])):
+            return np.nan
+        if j > FADED_ROWS:
+            usual[j - FADED_ROWS - 1] = side.measured[3, believed[m]]
+    return median(usual, USUAL_ROWS)
 
 
 @njit(cache=True, nogil=True)

@@ -125,6 +125,8 @@ def test_joint_covariance_is_smaller_than_either() -> None:
 
 
 STRIPES = 24
+JOINT = 9
+"""Beside the sources of published points."""
 
 
 def moved(camera: CameraCalibration, u_px: float, v_px: float) -> CameraCalibration:
@@ -139,7 +141,9 @@ def test_covariances_of_emulated_stripes_are_honest() -> None:
     """Planes are 0.02 mm and cameras 0.01 px off, otherwise for each stripe; NEES averages to one."""
     off_mm = 0.02 * np.random.default_rng(0).choice([-1, 1], STRIPES)
     off_px = 0.01 * np.random.default_rng(1).choice([-1, 1], (STRIPES, 4))
-    nees: dict[int, list[np.ndarray]] = {source: [] for source in (OpticalSource.STEREO, OpticalSource.ACTIVE_LEFT, 9)}
+    nees: dict[int, list[np.ndarray]] = {
+        source: [] for source in (OpticalSource.STEREO, OpticalSource.ACTIVE_LEFT, JOINT)
+    }
     for i, x_mm in enumerate(np.linspace(-90, 90, STRIPES)):
         scene = (matte, plate)[i % 2]()
         left, right = moved(camera_of(TRUTH.left), *off_px[i, :2]), moved(camera_of(TRUTH.right), *off_px[i, 2:])
@@ -160,7 +164,7 @@ def test_covariances_of_emulated_stripes_are_honest() -> None:
             )
             for source in (OpticalSource.STEREO, OpticalSource.ACTIVE_LEFT)
             for k in [seen.points["source"] == source]
-        } | {9: (seen.joint_mm.T, covariance.full(seen.joint_covariance), rows)}
+        } | {JOINT: (seen.joint_mm.T, covariance.full(seen.joint_covariance), rows)}
         for source, (points, own, row) in placed.items():
             off = points - lit[row]
             known = np.isfinite(off[:, 0]) & ~edge[row]

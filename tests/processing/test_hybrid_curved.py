@@ -8,7 +8,7 @@ from typing import cast
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from echolume_drivers.emulated import scene_file
@@ -75,6 +75,7 @@ def pings_over(ball: Ball, noise_mm: float) -> tuple[Sounding, Heard]:
 
 
 @given(slopes, slopes, bends, bends, st.floats(-40, 40), st.floats(-40, 40))
+@example(0.0, 0.0, 0.0, -2.2e-311, 0.0, 0.0)
 def test_the_nearest_place_stands_upright_below_its_point(
     sx: float, sy: float, xx: float, yy: float, x_mm: float, y_mm: float
 ) -> None:

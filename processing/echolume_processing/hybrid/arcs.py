@@ -13,6 +13,9 @@ STEEPEST_SINE = 0.98
 STEEP_SINE = 0.9
 """Up to here Newton finds the way to the nearest place from."""
 
+FLAT_PER_MM = 1e-12
+"""What bends less is steep nowhere in reach."""
+
 Values = NDArray[np.float64]
 
 
@@ -40,7 +43,7 @@ class Arc:
     def short_of(self, along_mm: Values) -> Values:
         """The same places, drawn to where the arc is not as steep as `STEEP_SINE`."""
         _, sine_here, per_mm = self._here()
-        if per_mm == 0.0:
+        if abs(per_mm) < FLAT_PER_MM:
             return along_mm
         ends_mm = (np.array([-STEEP_SINE, STEEP_SINE]) - sine_here) / per_mm
         return np.clip(along_mm, ends_mm.min(), ends_mm.max())
